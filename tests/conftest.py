@@ -1,0 +1,46 @@
+"""Prepare the process before jax starts, hold the library to its declared types, and share fixtures."""
+
+import contextlib
+import io
+import os
+
+from experiments.process import prepare
+
+# Two CPU devices, so that sharding is exercised everywhere. Compiling what is small is faster than its cache.
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+prepare()
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Every annotated function of the library is checked against the shapes and types it promises.
+install_import_hook("creps_jax", "beartype.beartype")
+
+# Importing MJX writes to stdout that Warp is missing; do it once here, where doctests cannot see it.
+with contextlib.redirect_stdout(io.StringIO()):
+    from mujoco import mjx  # noqa: F401
+
+
+@contextlib.contextmanager
+def relaxed():
+    """Allow implicit dtype and rank promotion, which MJX relies on."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+@pytest.fixture
+def relaxed_promotion():
+    """Run the whole test with implicit promotion allowed, as code that calls MJX needs."""
+    with relaxed():
+        yield
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    """Return the key that tests without a seed of their own start from."""
+    return jax.random.key(0)
