@@ -1,0 +1,331 @@
+"""Weigh samples by contextual relative entropy policy search: the dual function, its minimum, the weights."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.core import Tracer
+from jax.scipy.special import logsumexp
+
+from creps_jax.linalg import centre_columns, exact_dot, whitening
+from creps_jax.minimise import minimise
+from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
+
+__all__ = ["DualSolution", "dual_objective", "sample_kl", "sample_weights", "solve_dual"]
+
+_NUM_ROUNDS = 4
+"""Rounds of standardising and minimising; later ones take a step or none where the first was enough."""
+_RESOLUTION = 5e-6
+"""Lowest temperature, as a share of the numbers whose difference is the advantage: what float32 can order."""
+_LEAST_SPREAD = 3e-4
+"""Directions of the standardised features with less spread are left out: in V they would be differences of
+large numbers."""
+_NEARLY_GREEDY = 0.99
+"""Share of the largest possible relative entropy that the weights get where the bound is out of reach."""
+
+
+class DualSolution(NamedTuple):
+    """Hold the minimum of the dual function, in units of the given rewards and features, and its quality."""
+
+    temperature: Float[Array, ""]
+    """The Lagrangian multiplier eta of the bound on the relative entropy, above zero."""
+    baseline_coef: Float[Array, " m"]
+    """The coefficients w of the baseline V(s) = phi(s)' w, which is determined up to a constant."""
+    grad_norm: Float[Array, ""]
+    """How far the constraints are from being met: the norm of the excess of the relative entropy and of the
+    mismatch of the standardised, uncorrelated features."""
+    num_steps: Int[Array, ""]
+    """Newton steps taken."""
+    is_active: Bool[Array, ""]
+    """Whether the relative entropy equals its bound. False where no temperature reaches it, with equal
+    rewards or too few samples: the weights are then nearly greedy."""
+
+
+def dual_objective(
+    log_temperature: ScalarLike,
+    baseline_coef: Float[Array, " m"],
+    reward: Float[Array, " n"],
+    features: Float[Array, "n m"],
+    valid: Bool[Array, " n"],
+    kl_bound: ScalarLike,
+) -> Scalar:
+    """Evaluate the dual function of contextual REPS on samples; convex in (temperature, baseline_coef).
+
+    Args:
+        log_temperature: Logarithm of the temperature eta.
+        baseline_coef: Coefficients w of the baseline V(s) = phi(s)' w.
+        reward: Reward R of each sample.
+        features: Baseline features phi of the context of each sample.
+        valid: Which samples count; what the others hold is never used.
+        kl_bound: Largest relative entropy epsilon between the weights and uniform weights.
+
+    Returns:
+        g(eta, w) = eta epsilon + mean(phi)' w + eta log mean exp((R - phi' w) / eta).
+
+    Source: Abdolmaleki et al. 2016, Eq. 13.
+    """
+    reward, features, counts = _mask(reward, features, valid)
+    num_samples = jnp.sum(counts, dtype=reward.dtype)
+    temperature = jnp.exp(log_temperature)
+    mean_features = jnp.sum(features, axis=0) / num_samples
+    advantage = (reward - exact_dot(features, baseline_coef)) / temperature
+    log_mean = logsumexp(advantage, where=counts) - jnp.log(num_samples)
+    return temperature * kl_bound + exact_dot(mean_features, baseline_coef) + temperature * log_mean
+
+
+def solve_dual(
+    reward: Float[Array, " n"],
+    features: Float[Array, "n m"],
+    valid: Bool[Array, " n"] | None = None,
+    *,
+    kl_bound: ScalarLike,
+) -> DualSolution:
+    """Minimise the dual function over the temperature and the baseline.
+
+    The answer does not depend on units: shifting the rewards changes no weight, scaling them by c scales the
+    temperature and the baseline by c. Features may be offset, scaled, collinear, or more than samples.
+
+    Args:
+        reward: Reward R of each sample.
+        features: Baseline features phi of the context of each sample.
+        valid: Which samples count; all by default. One whose reward or features are not finite never does.
+        kl_bound: Largest relative entropy epsilon between the weights and uniform weights, above zero.
+
+    Returns:
+        The solution, finite for any number of samples that count, none included. Where the bound is active,
+        the relative entropy of `sample_weights` equals it and they keep the mean of the features.
+
+    Raises:
+        ValueError: If shapes do not fit or `kl_bound` is not a positive number.
+
+    Source: Abdolmaleki et al. 2016, Eq. 12 and 13.
+    """
+    valid = _check_samples(reward, features, valid)
+    if not isinstance(kl_bound, Tracer) and not 0.0 < float(kl_bound) < math.inf:
+        raise ValueError(f"kl_bound has to be a positive number, got {kl_bound}")
+    kl_bound = jnp.asarray(kl_bound, reward.dtype)
+    samples, unit = _standardise(reward, features, valid)
+
+    guess = _search(samples, kl_bound)
+    solution = DualSolution(
+        temperature=jnp.maximum(unit * guess.temperature, jnp.finfo(unit.dtype).tiny),
+        baseline_coef=unit * guess.baseline_coef,
+        grad_norm=jnp.zeros_like(unit),
+        num_steps=guess.num_steps,
+        is_active=guess.is_active,
+    )
+    # The quality is that of the weights as the caller gets them, with the rounding of the solution.
+    weights = sample_weights(solution, reward, features, valid)
+    excess = sample_kl(weights, samples.counts & jnp.any(weights > 0)) - kl_bound
+    excess = jnp.where(guess.is_active, excess, jnp.maximum(excess, 0.0))
+    uniform = jnp.where(samples.counts, 1.0 / jnp.sum(samples.counts, dtype=weights.dtype), 0.0)
+    mismatch = exact_dot(weights - uniform, samples.whitened)
+    return solution._replace(grad_norm=jnp.sqrt(excess**2 + jnp.sum(mismatch**2)))
+
+
+def sample_weights(
+    solution: DualSolution,
+    reward: Float[Array, " n"],
+    features: Float[Array, "n m"],
+    valid: Bool[Array, " n"] | None = None,
+) -> Float[Array, " n"]:
+    """Weigh the samples by exp((R - V(s)) / eta).
+
+    Args:
+        solution: Temperature eta and baseline coefficients w, from `solve_dual` on the same samples.
+        reward: Reward R of each sample.
+        features: Baseline features phi of the context of each sample.
+        valid: Which samples count; all by default. One whose reward or features are not finite never does.
+
+    Returns:
+        Weights that sum to one, zero where a sample does not count; all zero if none does.
+
+    Raises:
+        ValueError: If shapes do not fit.
+
+    Source: Abdolmaleki et al. 2016, the solution p(s, theta) below Eq. 12.
+    """
+    valid = _is_counted(reward, features, _check_samples(reward, features, valid))
+    reward, features, counts = _mask(reward, features, valid)
+    shifted, centred = _shift(reward, counts), centre_columns(features, counts)
+    advantage = (shifted - exact_dot(centred, solution.baseline_coef)) / solution.temperature
+    return jnp.where(valid, _softmax(advantage, counts), 0.0)
+
+
+def sample_kl(weights: Float[Array, " n"], valid: Bool[Array, " n"] | None = None) -> Scalar:
+    """Return the relative entropy between weights and uniform weights over the samples that count.
+
+    Args:
+        weights: Weights that sum to one, zero where a sample does not count.
+        valid: Which samples count; all by default.
+
+    Returns:
+        sum d log(n d), between 0 and log n.
+
+    Raises:
+        ValueError: If the shapes differ.
+    """
+    valid = jnp.ones(weights.shape, bool) if valid is None else valid
+    if weights.shape != valid.shape:
+        raise ValueError(f"weights and valid have to have one shape, got {weights.shape} and {valid.shape}")
+    num_samples = jnp.maximum(jnp.sum(valid, dtype=weights.dtype), 1.0)
+    # As a mean of x log x - x + 1, x = n d, whose terms are not negative: sum d log(n d) would cancel.
+    change = weights * num_samples - 1.0
+    is_weighted = change > -1.0
+    change = jnp.where(is_weighted, change, 0.0)
+    terms = jnp.where(is_weighted, (1.0 + change) * jnp.log1p(change) - change, 1.0)
+    return jnp.sum(jnp.where(valid, terms, 0.0)) / num_samples
+
+
+class _Samples(NamedTuple):
+    """Standardised samples; all rows that do not count are zero."""
+
+    reward: Array  # from -1 to 0
+    centred: Array  # features less their mean
+    whitening: Array
+    whitened: Array  # centred @ whitening: uncorrelated features of mean square one
+    counts: Array
+
+
+class _Guess(NamedTuple):
+    """A point on the way to the minimum, in units of the standardised samples."""
+
+    temperature: Array
+    baseline_coef: Array
+    floor: Array  # of the temperature
+    is_active: Array
+    num_steps: Array
+
+
+def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
+    """Return the solution for a small bound: a least-squares baseline, and the spread that it leaves."""
+    num_samples = jnp.sum(samples.counts, dtype=samples.reward.dtype)
+    coef = exact_dot(samples.whitening, exact_dot(samples.reward, samples.whitened)) / num_samples
+    residual = samples.reward - exact_dot(samples.centred, coef)
+    residual = jnp.where(samples.counts, residual - jnp.sum(residual) / num_samples, 0.0)
+    # For a small bound the relative entropy is var(R - V) / (2 eta^2).
+    temperature = jnp.sqrt(jnp.sum(residual**2) / (2.0 * num_samples * kl_bound))
+    mean_size = -jnp.sum(samples.reward) / num_samples
+    floor = _RESOLUTION * jnp.where(mean_size > 0, mean_size, 1.0)
+    no_steps = jnp.zeros((), jnp.int32)
+    return _Guess(jnp.maximum(temperature, 2.0 * floor), coef, floor, jnp.ones((), bool), no_steps)
+
+
+def _search(samples: _Samples, kl_bound: Array) -> _Guess:
+    """Improve a first guess in a fixed number of rounds; midway, give up a bound that is out of reach.
+
+    One round is enough for well-behaved rewards. Where some are far worse than the others (falls), the scale
+    and the baseline of all rewards say little of those that end up with a weight: each round takes both from
+    the weights of the last.
+    """
+    first = _first_guess(samples, kl_bound)
+
+    def improve(carry: tuple[_Guess, Array], is_midway: Array) -> tuple[tuple[_Guess, Array], None]:
+        guess, bound = carry
+        kl = sample_kl(_weigh(guess, samples), samples.counts)
+        is_out_of_reach = is_midway & ((guess.temperature <= 1.1 * guess.floor) | (kl < 0.999 * kl_bound))
+        # Rounding decides among greedy weights: start again, and stop a little short of them.
+        bound = jnp.where(is_out_of_reach, _NEARLY_GREEDY * kl, bound)
+        restart = first._replace(is_active=jnp.zeros((), bool), num_steps=guess.num_steps)
+        guess = jax.tree.map(lambda new, old: jnp.where(is_out_of_reach, new, old), restart, guess)
+        return (_improve(guess, samples, bound), bound), None
+
+    is_midway = jnp.arange(2 * _NUM_ROUNDS) == _NUM_ROUNDS
+    return lax.scan(improve, (first, kl_bound), is_midway)[0][0]
+
+
+def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
+    """Standardise the rewards by the last guess, and minimise the dual function of what is left."""
+    floor = _temperature_floor(guess, samples)
+    unit = jnp.maximum(guess.temperature, 2.0 * floor)
+    share = floor / unit
+    residual = _shift(_advantage(samples, unit, guess.baseline_coef), samples.counts)
+
+    def temperature_of(variable: Array) -> Array:
+        # The floor keeps the minimum finite where no temperature above zero reaches the bound.
+        return share + (1.0 - share) * jnp.exp(variable)
+
+    def objective(variables: Array) -> Array:
+        log_temperature, coef = jnp.log(temperature_of(variables[0])), variables[1:]
+        return dual_objective(log_temperature, coef, residual, samples.whitened, samples.counts, kl_bound)
+
+    start = jnp.zeros(1 + samples.whitened.shape[1], residual.dtype)
+    # In units of the temperature: weights change by factors up to e^10 times the whitened features.
+    max_change = jnp.full_like(start, 10.0).at[0].set(2.0)
+    minimum = minimise(objective, start, max_steps=40, max_change=max_change)
+    temperature = unit * temperature_of(minimum.point[0])
+    return _Guess(
+        temperature=temperature,
+        baseline_coef=guess.baseline_coef + unit * exact_dot(samples.whitening, minimum.point[1:]),
+        floor=floor,
+        is_active=guess.is_active,
+        num_steps=guess.num_steps + minimum.num_steps,
+    )
+
+
+def _temperature_floor(guess: _Guess, samples: _Samples) -> Array:
+    """Return the temperature below which rounding of the advantages would decide between samples."""
+    # An advantage is a difference of these numbers and carries their rounding.
+    size = jnp.abs(samples.reward) + exact_dot(jnp.abs(samples.centred), jnp.abs(guess.baseline_coef))
+    mean_size = exact_dot(_weigh(guess, samples), size)
+    lowered = jnp.maximum(_RESOLUTION * mean_size, 1e-3 * guess.floor)
+    return jnp.where(mean_size > 0, lowered, guess.floor)
+
+
+def _weigh(guess: _Guess, samples: _Samples) -> Array:
+    return _softmax(_advantage(samples, guess.temperature, guess.baseline_coef), samples.counts)
+
+
+def _standardise(reward: Array, features: Array, valid: Array) -> tuple[_Samples, Array]:
+    """Return standardised samples, and the unit of their rewards."""
+    reward, features, counts = _mask(reward, features, valid)
+    shifted = _shift(reward, counts)
+    spread = jnp.max(jnp.abs(shifted))
+    # Equal rewards have no spread: their unit is then that of their rounding.
+    rounding = jnp.finfo(reward.dtype).eps * jnp.max(jnp.abs(reward))
+    unit = jnp.where(spread > 0, spread, jnp.where(rounding > 0, rounding, 1.0))
+    centred = centre_columns(features, counts)
+    matrix = whitening(centred, counts, least_spread=_LEAST_SPREAD)
+    return _Samples(shifted / unit, centred, matrix, exact_dot(centred, matrix), counts), unit
+
+
+def _advantage(samples: _Samples, temperature: Array, baseline_coef: Array) -> Array:
+    return (samples.reward - exact_dot(samples.centred, baseline_coef)) / temperature
+
+
+def _softmax(advantage: Array, counts: Array) -> Array:
+    return jax.nn.softmax(jnp.where(counts, advantage, -jnp.inf))
+
+
+def _shift(values: Array, counts: Array) -> Array:
+    """Subtract the largest of the values that count, which changes no weight; the others become zero."""
+    largest = jnp.max(jnp.where(counts, values, -jnp.inf))
+    return jnp.where(counts, values - largest, 0.0)
+
+
+def _mask(reward: Array, features: Array, valid: Array) -> tuple[Array, Array, Array]:
+    """Put zeros where a sample does not count, and say which do; where none does, all do, as zeros.
+
+    It comes before any arithmetic: neither values nor gradients see what a sample that does not count holds.
+    """
+    counts = _is_counted(reward, features, valid)
+    reward = jnp.where(counts, reward, 0.0)
+    features = jnp.where(counts[:, None], features, 0.0)
+    return reward, features, counts | ~jnp.any(counts)
+
+
+def _is_counted(reward: Array, features: Array, valid: Array) -> Array:
+    return valid & jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
+
+
+def _check_samples(reward: Array, features: Array, valid: Array | None) -> Array:
+    """Return the mask of valid samples, all by default, after checking shapes."""
+    if reward.ndim != 1 or features.ndim != 2 or features.shape[0] != reward.shape[0] or 0 in features.shape:
+        raise ValueError(f"need reward (n,) and features (n, m), got shapes {reward.shape}, {features.shape}")
+    if valid is None:
+        return jnp.ones(reward.shape, bool)
+    if valid.shape != reward.shape:
+        raise ValueError(f"valid has to have the shape of reward, {reward.shape}, got {valid.shape}")
+    return valid

@@ -1,0 +1,145 @@
+"""Make features of the context: linear, quadratic, normalised radial basis functions."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from creps_jax.typing import Array, Float, VectorLike
+
+__all__ = ["FeatureMap", "linear_features", "quadratic_features", "rbf_features"]
+
+_FAR = 1e20
+"""Distance from the range, in bandwidths, beyond which a context counts as that far: no overflow."""
+
+
+class FeatureMap(NamedTuple):
+    """Hold a function from a context (context_dim,) to features (size,), and both numbers."""
+
+    apply: Callable[[Float[Array, " s"]], Float[Array, " m"]]
+    size: int
+    context_dim: int
+
+
+def linear_features(dim: int) -> FeatureMap:
+    """Make the features [1, s] of an affine policy.
+
+    Args:
+        dim: Number of context variables.
+
+    Returns:
+        The map to 1 + dim features.
+
+    Raises:
+        ValueError: If `dim` is below 1; on `apply`, if a context has another shape than (dim,).
+
+    Source: Abdolmaleki et al. 2016, text below Eq. 15.
+    """
+    _check_dim("linear_features", dim)
+
+    def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
+        _check_context(context, dim)
+        return jnp.concatenate([jnp.ones_like(context[:1]), context])
+
+    return FeatureMap(apply, 1 + dim, dim)
+
+
+def quadratic_features(dim: int) -> FeatureMap:
+    """Make the features [s, s^2] of a quadratic baseline.
+
+    As the paper writes them: the squares of each variable without products of two, and no constant, along
+    which the dual function does not change. A policy needs one: `linear_features` and `rbf_features` have it.
+
+    Args:
+        dim: Number of context variables.
+
+    Returns:
+        The map to 2 dim features.
+
+    Raises:
+        ValueError: If `dim` is below 1; on `apply`, if a context has another shape than (dim,).
+
+    Source: Abdolmaleki et al. 2016, text below Eq. 11 and 15.
+    """
+    _check_dim("quadratic_features", dim)
+
+    def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
+        _check_context(context, dim)
+        return jnp.concatenate([context, context**2])
+
+    return FeatureMap(apply, 2 * dim, dim)
+
+
+def rbf_features(
+    low: VectorLike, high: VectorLike, num_centers: int, *, bandwidth: VectorLike | None = None
+) -> FeatureMap:
+    """Make normalised radial basis functions on a full grid of centres.
+
+    Centres are equally spaced from `low` to `high`, both included (one centre: the middle). The features of a
+    context are not negative and sum to one; far outside the range only that of the nearest centre is left.
+
+    Args:
+        low: Lower end of the range of each context variable.
+        high: Upper end of the range of each context variable.
+        num_centers: Number of centres K along each context variable.
+        bandwidth: Width sigma along each context variable, in its unit; (high - low) / K by default.
+
+    Returns:
+        The map to K^dim features, the last context variable changing fastest.
+
+    Raises:
+        ValueError: If the settings differ in length, a number is not finite, low >= high, num_centers < 1 or
+            bandwidth <= 0; on `apply`, if a context has another shape than (dim,).
+
+    Source: Abdolmaleki et al. 2016, Eq. 16. The paper prints the default width for sigma squared, whose unit
+    it does not have.
+    """
+    lows, highs, widths = _rbf_settings(low, high, num_centers, bandwidth)
+    dim = lows.size
+    places = np.linspace(0.0, 1.0, num_centers) if num_centers > 1 else np.array([0.5])
+    grid = np.stack(np.meshgrid(*[places] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    centers = lows + grid * (highs - lows)
+
+    def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
+        _check_context(context, dim)
+        dtype = context.dtype
+        nearest = jnp.clip(context, jnp.asarray(lows, dtype), jnp.asarray(highs, dtype))
+        width = jnp.asarray(widths, dtype)
+        inside = (nearest[None, :] - jnp.asarray(centers, dtype)) / width[None, :]
+        outside = jnp.clip((context - nearest) / width, -_FAR, _FAR)
+        # -(s - c)^2 / 2 sigma^2 less the term all centres share, which far outside would drown the others.
+        log_weights = -jnp.sum(0.5 * inside**2 + outside[None, :] * inside, axis=1)
+        return jax.nn.softmax(log_weights)
+
+    return FeatureMap(apply, centers.shape[0], dim)
+
+
+def _rbf_settings(
+    low: VectorLike, high: VectorLike, num_centers: int, bandwidth: VectorLike | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return low, high and width of each context variable as arrays of one length, after checking them."""
+    if isinstance(num_centers, bool) or not isinstance(num_centers, int | np.integer) or num_centers < 1:
+        raise ValueError(f"num_centers has to be a whole number >= 1, got {num_centers!r}")
+    lows, highs = np.atleast_1d(np.asarray(low, float)), np.atleast_1d(np.asarray(high, float))
+    if lows.ndim != 1 or lows.shape != highs.shape:
+        raise ValueError(f"low and high have to be of one length, got shapes {lows.shape} and {highs.shape}")
+    if not (np.all(np.isfinite(lows)) and np.all(np.isfinite(highs)) and np.all(lows < highs)):
+        raise ValueError(f"low has to be below high, both finite, got low={low} and high={high}")
+    widths = (highs - lows) / num_centers if bandwidth is None else np.asarray(bandwidth, float)
+    if widths.ndim > 1 or widths.shape not in ((), (1,), lows.shape):
+        raise ValueError(f"bandwidth has to be a number or as long as low, {lows.size}, got {bandwidth}")
+    if not (np.all(np.isfinite(widths)) and np.all(widths > 0)):
+        raise ValueError(f"bandwidth has to be finite and above zero, got {bandwidth}")
+    return lows, highs, np.broadcast_to(widths, lows.shape)
+
+
+def _check_dim(name: str, dim: int) -> None:
+    if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim < 1:
+        raise ValueError(f"{name} needs a whole number of context variables >= 1, got {dim!r}")
+
+
+def _check_context(context: Array, dim: int) -> None:
+    if context.shape != (dim,):
+        raise ValueError(f"a context has to have shape ({dim},), got {context.shape}")

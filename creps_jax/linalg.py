@@ -1,0 +1,205 @@
+"""Solve the small linear systems of the library: tridiagonal, regression, Cholesky, whitening."""
+
+from typing import TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from creps_jax.typing import Array, Bool, Float, ScalarLike
+
+__all__ = [
+    "centre_columns",
+    "exact_dot",
+    "safe_cholesky",
+    "thomas_solve",
+    "weighted_ridge",
+    "whitening",
+]
+
+_Pair: TypeAlias = tuple[Array, Array]
+
+
+def exact_dot(left: Float[Array, "..."], right: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Multiply vectors or matrices as `jnp.dot` does, in the full precision of their format.
+
+    Accelerators otherwise multiply float32 matrices with a mantissa of 10 bits.
+    """
+    return jnp.dot(left, right, precision=lax.Precision.HIGHEST)
+
+
+def thomas_solve(
+    lower: Float[Array, " n"],
+    diag: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    rhs: Float[Array, " n"],
+) -> Float[Array, " n"]:
+    """Solve a tridiagonal system by the Thomas algorithm.
+
+    Row k reads `lower[k] x[k-1] + diag[k] x[k] + upper[k] x[k+1] = rhs[k]`. Elimination does not pivot: the
+    system has to be diagonally dominant (as that of the centre of mass is) or positive definite. Several
+    right-hand sides are a `jax.vmap` over `rhs`.
+
+    Args:
+        lower: Entries below the diagonal; `lower[0]` is not used.
+        diag: Entries on the diagonal.
+        upper: Entries above the diagonal; `upper[-1]` is not used.
+        rhs: Right-hand side.
+
+    Returns:
+        The solution x.
+
+    Raises:
+        ValueError: If the four are not vectors of one length n >= 1.
+
+    Source: Abdolmaleki et al. 2016, Eq. 7 and 8 (with `a(k)` in the denominator, which the print has wrong).
+    """
+    shapes = [jnp.shape(array) for array in (lower, diag, upper, rhs)]
+    if len(set(shapes)) != 1 or len(shapes[0]) != 1 or shapes[0][0] < 1:
+        raise ValueError(f"thomas_solve needs four vectors of one length n >= 1, got shapes {shapes}")
+    # What is not used must not enter: zero times a non-finite number is not zero.
+    lower = lower.at[0].set(0.0)
+    upper = upper.at[-1].set(0.0)
+
+    def eliminate(above: _Pair, row: tuple[Array, Array, Array, Array]) -> tuple[_Pair, _Pair]:
+        upper_above, rhs_above = above
+        low, pivot, up, value = row
+        denominator = pivot - low * upper_above
+        scaled = (up / denominator, (value - low * rhs_above) / denominator)
+        return scaled, scaled
+
+    def substitute(x_below: Array, row: _Pair) -> _Pair:
+        scaled_upper, scaled_rhs = row
+        x = scaled_rhs - scaled_upper * x_below
+        return x, x
+
+    zero = jnp.zeros_like(rhs[0])
+    _, reduced = lax.scan(eliminate, (zero, zero), (lower, diag, upper, rhs))
+    _, solution = lax.scan(substitute, zero, reduced, reverse=True)
+    return solution
+
+
+def weighted_ridge(
+    features: Float[Array, "n p"],
+    targets: Float[Array, "n d"],
+    weights: Float[Array, " n"],
+    *,
+    ridge: ScalarLike,
+) -> Float[Array, "p d"]:
+    """Fit targets by a linear function of features under a ridge relative to the size of each feature.
+
+    Minimises `sum_i d_i |y_i - B' x_i|^2 / sum_i d_i + ridge sum_j q_j |B_j|^2`, where q_j is the weighted
+    mean square of feature j, so that the fit does not depend on the units of features or targets. An
+    orthogonal factorisation bears features on a large offset, which normal equations in float32 do not.
+
+    Args:
+        features: Features x, one row a sample.
+        targets: Targets y, one row a sample.
+        weights: Weights d of the samples, not negative; a sample of weight zero may hold anything.
+        ridge: Strength of the penalty, not negative. Zero is raised to the resolution of the format, which
+            keeps the fit finite with collinear features or fewer samples than features.
+
+    Returns:
+        The coefficients B.
+
+    Raises:
+        ValueError: If the numbers of samples differ.
+
+    Source: Abdolmaleki et al. 2016, Eq. 14.
+    """
+    num_samples, num_features = features.shape
+    if targets.shape[0] != num_samples or weights.shape != (num_samples,):
+        raise ValueError(
+            "weighted_ridge needs features (n, p), targets (n, d) and weights (n,), "
+            f"got shapes {features.shape}, {targets.shape} and {weights.shape}"
+        )
+    eps = jnp.finfo(features.dtype).eps
+    is_weighted = (weights > 0)[:, None]
+    total = jnp.sum(weights)
+    root = jnp.sqrt(jnp.where(is_weighted, weights[:, None], 0.0) / jnp.where(total > 0, total, 1.0))
+    rows = root * jnp.where(is_weighted, features, 0.0)
+    values = root * jnp.where(is_weighted, targets, 0.0)
+    size = jnp.linalg.norm(rows, axis=0)
+    size = jnp.where(size > 0, size, 1.0)
+    damping = jnp.sqrt(jnp.maximum(jnp.asarray(ridge, features.dtype), num_features * (4.0 * eps) ** 2))
+    penalty = damping * jnp.eye(num_features, dtype=features.dtype)
+    orthogonal, triangular = jnp.linalg.qr(jnp.concatenate([rows / size[None, :], penalty]))
+    projected = exact_dot(orthogonal[:num_samples].T, values)
+    return jax.scipy.linalg.solve_triangular(triangular, projected) / size[:, None]
+
+
+def safe_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """Factor a symmetric matrix after adding the least multiple of the identity that makes it definite.
+
+    Args:
+        matrix: Symmetric matrix, meant to be positive definite; only its symmetric part counts. Its diagonal
+            should have like entries (that of a correlation matrix has), because what is added is relative to
+            the largest entry. Entries that are not finite count as zero.
+
+    Returns:
+        Lower triangular L, finite and with a positive diagonal, `L L' = matrix + jitter I`. The jitter is
+        zero where the smallest eigenvalue is above the rounding error of the largest. A matrix of zeros gets
+        the jitter of the identity.
+
+    Raises:
+        ValueError: If the matrix is not square.
+    """
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise ValueError(f"safe_cholesky needs a square matrix, got shape {matrix.shape}")
+    matrix = jnp.where(jnp.isfinite(matrix), matrix, 0.0)
+    scale = jnp.max(jnp.abs(matrix))
+    scale = jnp.where(scale > 0, scale, 1.0)
+    unit = matrix / scale
+    unit = 0.5 * (unit + unit.T)
+    size = matrix.shape[0]
+    # Eigenvalues carry an error of about d eps; the smallest has to be above it for the factor to exist.
+    least = 4.0 * size * jnp.finfo(matrix.dtype).eps
+    jitter = jnp.maximum(least - jnp.linalg.eigvalsh(unit)[0], 0.0)
+    return jnp.linalg.cholesky(unit + jitter * jnp.eye(size, dtype=matrix.dtype)) * jnp.sqrt(scale)
+
+
+def centre_columns(rows: Float[Array, "n m"], counts: Bool[Array, " n"]) -> Float[Array, "n m"]:
+    """Subtract the mean of the rows that count.
+
+    Args:
+        rows: Rows; those that do not count have to be finite.
+        counts: Which rows count, at least one.
+
+    Returns:
+        The centred rows. Rows that do not count, and columns that are constant up to rounding, are zero.
+    """
+    num_rows = jnp.sum(counts, dtype=rows.dtype)
+    centred = jnp.where(counts[:, None], rows, 0.0)
+    rounding = 4.0 * jnp.finfo(rows.dtype).eps * jnp.max(jnp.abs(centred), axis=0)
+    for _ in range(2):  # the first mean is rounded in units of the offset
+        centred = jnp.where(counts[:, None], centred - (jnp.sum(centred, axis=0) / num_rows)[None, :], 0.0)
+    is_constant = jnp.max(jnp.abs(centred), axis=0) <= rounding
+    return jnp.where(is_constant[None, :], 0.0, centred)
+
+
+def whitening(
+    centred: Float[Array, "n m"], counts: Bool[Array, " n"], *, least_spread: ScalarLike
+) -> Float[Array, "m k"]:
+    """Return the matrix W for which the columns of `centred @ W` are uncorrelated with mean square one.
+
+    Args:
+        centred: Rows with a mean of zero, from `centre_columns`.
+        counts: Which rows count, at least one.
+        least_spread: Directions with less spread than this, in columns scaled to spread one, are taken for
+            rounding: their columns of W are zero.
+
+    Returns:
+        W; it has k = min(n, m) columns.
+    """
+    root_count = jnp.sqrt(jnp.sum(counts, dtype=centred.dtype))
+    unscale = _invert_above(jnp.linalg.norm(centred, axis=0) / root_count, 0.0)
+    # Singular values of the columns, not eigenvalues of their products: those would square the rounding.
+    triangular = jnp.linalg.qr(centred * unscale[None, :], mode="r")
+    _, singular_values, axes = jnp.linalg.svd(triangular, full_matrices=False)
+    return unscale[:, None] * axes.T * _invert_above(singular_values / root_count, least_spread)[None, :]
+
+
+def _invert_above(values: Array, threshold: ScalarLike) -> Array:
+    """Return the reciprocal of each value above a threshold, zero of the others."""
+    is_above = values > threshold
+    return jnp.where(is_above, 1.0 / jnp.where(is_above, values, 1.0), 0.0)

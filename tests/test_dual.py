@@ -1,0 +1,405 @@
+"""The dual is Eq. 13, its minimum is SciPy's, and the weights meet their constraints whatever the rewards."""
+
+import inspect
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import softmax
+
+from creps_jax.dual import dual_objective, sample_kl, sample_weights, solve_dual
+from tests.oracles import dual_scipy
+
+NUM = 200
+NUM_FEATURES = 5
+
+
+TRACES = []
+
+
+@jax.jit
+def solve(reward, features, valid, kl_bound):
+    TRACES.append(features.shape)
+    solution = solve_dual(reward, features, valid, kl_bound=kl_bound)
+    return solution, sample_weights(solution, reward, features, valid)
+
+
+def solve_all(reward, features, kl_bound=0.5):
+    """Solve with all samples valid; return the solution and its weights in float64."""
+    reward, features = jnp.asarray(reward, jnp.float32), jnp.asarray(features, jnp.float32)
+    solution, weights = solve(reward, features, jnp.ones(reward.shape, bool), jnp.float32(kl_bound))
+    return solution, np.asarray(weights, np.float64)
+
+
+def radial(context, num_centers=NUM_FEATURES, width=None):
+    centers = np.linspace(0, 1, num_centers)
+    return softmax(-0.5 * ((context[:, None] - centers) / (width or 1 / num_centers)) ** 2, axis=1)
+
+
+def samples(seed=0):
+    """Return contexts, their features, and rewards as in the sinus task."""
+    rng = np.random.default_rng(seed)
+    context = rng.uniform(size=NUM)
+    reward = -((rng.normal(size=NUM) - np.sin(6 * context)) ** 2)
+    return context, radial(context), reward
+
+
+def mismatch(weights, features):
+    """Return the largest change of a feature's mean, in standard deviations of that feature."""
+    features = np.asarray(np.float32(features), np.float64)
+    return np.max(np.abs(weights @ (features - features.mean(0))) / features.std(0))
+
+
+def assert_meets_constraints(solution, weights, features, kl_bound):
+    assert bool(solution.is_active)
+    assert dual_scipy.kl_to_uniform(weights) == pytest.approx(kl_bound, rel=1e-3)
+    assert mismatch(weights, features) < 1e-4
+    assert float(solution.grad_norm) < 3e-4
+
+
+def assert_finite(*trees):
+    for leaf in jax.tree.leaves(trees):
+        assert np.all(np.isfinite(leaf))
+
+
+# The function.
+
+
+def test_objective_is_equation_13_in_float64():
+    _, features, reward = samples()
+    rng = np.random.default_rng(1)
+    for log_temperature in (-1.0, 0.0, 2.0):
+        coef = rng.normal(size=NUM_FEATURES)
+        value = dual_objective(
+            jnp.float32(log_temperature),
+            jnp.float32(coef),
+            jnp.float32(reward),
+            jnp.float32(features),
+            jnp.ones(NUM, bool),
+            0.5,
+        )
+        expected = dual_scipy.objective(np.exp(log_temperature), coef, reward, features, 0.5)
+        np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_objective_is_convex_on_chords():
+    _, features, reward = samples()
+    rng = np.random.default_rng(2)
+    ends = rng.normal(size=(2, 500, 1 + NUM_FEATURES)) * 2
+    ends[..., 0] = np.exp(ends[..., 0])  # the temperature, in which (not in its logarithm) it is convex
+    evaluate = jax.jit(
+        jax.vmap(
+            lambda point: dual_objective(
+                jnp.log(point[0]),
+                point[1:],
+                jnp.float32(reward),
+                jnp.float32(features),
+                jnp.ones(NUM, bool),
+                0.5,
+            )
+        )
+    )
+    share = rng.uniform(size=(500, 1))
+    middle = share * ends[0] + (1 - share) * ends[1]
+    left, right, between = (np.asarray(evaluate(jnp.float32(p)), np.float64) for p in (*ends, middle))
+    chord = share[:, 0] * left + (1 - share[:, 0]) * right
+    assert np.all(between <= chord + 1e-5 * (1 + np.abs(chord)))
+
+
+def test_objective_is_flat_along_constants_that_features_span():
+    _, features, reward = samples()
+    args = (jnp.float32(reward), jnp.float32(features), jnp.ones(NUM, bool), 0.5)
+    coef = jnp.linspace(-1.0, 1.0, NUM_FEATURES)
+    np.testing.assert_allclose(
+        dual_objective(0.3, coef, *args), dual_objective(0.3, coef + 7.0, *args), atol=1e-5
+    )
+
+
+# The minimum.
+
+
+@pytest.mark.parametrize("kl_bound", [0.001, 0.1, 0.5, 1.5, 2.5])
+def test_minimum_is_that_of_scipy(kl_bound):
+    _, features, reward = samples()
+    solution, weights = solve_all(reward, features, kl_bound)
+    temperature, _, expected = dual_scipy.solve(np.float32(reward), np.float32(features), kl_bound)
+    assert float(solution.temperature) == pytest.approx(temperature, rel=1e-3)
+    np.testing.assert_allclose(weights, expected, rtol=2e-3, atol=1e-7)
+    assert_meets_constraints(solution, weights, features, kl_bound)
+
+
+def falls(rng, num_falls, depth):
+    """Return rewards of a task well done, around -0.01, but for a few samples far below."""
+    reward = -10 * rng.normal(scale=0.03, size=NUM) ** 2
+    reward[rng.permutation(NUM)[:num_falls]] -= depth
+    return reward
+
+
+EXTREME = {
+    "one fall": lambda rng: falls(rng, 1, 100),
+    "twenty falls": lambda rng: falls(rng, 20, 100),
+    "half falls": lambda rng: falls(rng, NUM // 2, 100),
+    "nearly all falls": lambda rng: falls(rng, NUM - 10, 100),
+    "one very deep fall": lambda rng: falls(rng, 1, 1e6),
+    "many very deep falls": lambda rng: falls(rng, 60, 1e6),
+    "two values": lambda rng: np.where(rng.uniform(size=NUM) < 0.3, 1.0, 0.0),
+    "three values": lambda rng: rng.choice([0.0, -1.0, -100.0], size=NUM, p=[0.2, 0.5, 0.3]),
+    "long tail below": lambda rng: -(np.abs(rng.standard_cauchy(NUM)) ** 3),
+    "long tail above": lambda rng: np.abs(rng.standard_cauchy(NUM)) ** 3,
+    "many magnitudes": lambda rng: -np.exp(5 * rng.normal(size=NUM)),
+}
+
+
+@pytest.mark.parametrize("name", EXTREME)
+def test_constraints_hold_for_extreme_rewards(name):
+    _, features, _ = samples()
+    reward = np.float32(EXTREME[name](np.random.default_rng(3)))
+    solution, weights = solve_all(reward, features)
+    assert_meets_constraints(solution, weights, features, 0.5)
+    temperature, _, expected = dual_scipy.solve(reward, np.float32(features), 0.5)
+    assert float(solution.temperature) == pytest.approx(temperature, rel=2e-3)
+    np.testing.assert_allclose(weights, expected, rtol=5e-3, atol=1e-6)
+
+
+def test_bound_beyond_nearly_tied_best_rewards_is_reached():
+    _, features, _ = samples()
+    rng = np.random.default_rng(4)
+    # Sixty good samples differ by 1e-5 of what parts them from the others, and the bound tells them apart.
+    reward = np.where(np.arange(NUM) < 60, -1e-5 * rng.uniform(size=NUM), -1.0 - rng.uniform(size=NUM))
+    solution, weights = solve_all(reward, features, 1.6)
+    assert_meets_constraints(solution, weights, features, 1.6)
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0, 1000.0])
+def test_constraints_hold_where_the_context_decides_the_reward(scale):
+    context, features, reward = samples()
+    solution, weights = solve_all(reward - scale * np.sin(3 * context), features)
+    assert_meets_constraints(solution, weights, features, 0.5)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda s: np.column_stack([s, 2 * s, s**2, 3 * s + 1, s - s**2]),
+        lambda s: np.column_stack([1e-6 * s, 1e6 * s**2, s**3, 1e3 + s, np.sin(9 * s)]),
+        lambda s: np.column_stack([s, s**2, s**3, s**4, s**5]),
+        lambda s: radial(s, NUM_FEATURES, 0.6),
+    ],
+    ids=["collinear", "scales and offsets", "monomials", "wide radial"],
+)
+def test_constraints_hold_for_awkward_features(make):
+    context, _, reward = samples()
+    features = make(context)
+    solution, weights = solve_all(reward, features)
+    assert_meets_constraints(solution, weights, features, 0.5)
+
+
+def test_constraints_hold_for_twenty_wide_radial_features():
+    context, _, reward = samples()
+    features = radial(context, 20, 0.3)
+    solution, weights = solve_all(reward, features)
+    assert_meets_constraints(solution, weights, features, 0.5)
+
+
+# Invariances.
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-9, 3.0, 1e9, 1e30])
+def test_scaling_rewards_scales_the_solution_and_keeps_the_weights(scale):
+    _, features, reward = samples()
+    plain, weights = solve_all(reward, features)
+    scaled, scaled_weights = solve_all(reward * scale, features)
+    np.testing.assert_allclose(scaled.temperature, scale * plain.temperature, rtol=1e-4)
+    np.testing.assert_allclose(
+        features @ scaled.baseline_coef / scale, features @ plain.baseline_coef, atol=1e-3
+    )
+    np.testing.assert_allclose(scaled_weights, weights, rtol=1e-3, atol=1e-7)
+
+
+@pytest.mark.parametrize("shift", [-1e6, 1e3, 1e6])
+def test_shifting_rewards_keeps_the_weights(shift):
+    _, features, reward = samples()
+    shifted = np.float32(np.float32(reward) + np.float32(shift))
+    # What the shift leaves of the rewards, after their rounding, without the shift.
+    rounded = np.float64(shifted) - np.float64(np.float32(shift))
+    solution, weights = solve_all(shifted, features)
+    expected_solution, expected = solve_all(rounded, features)
+    np.testing.assert_allclose(solution.temperature, expected_solution.temperature, rtol=1e-4)
+    np.testing.assert_allclose(weights, expected, rtol=1e-3, atol=1e-7)
+
+
+def test_mask_equals_subset():
+    _, features, reward = samples()
+    valid = np.random.default_rng(5).uniform(size=NUM) < 0.5
+    reward, features = jnp.float32(reward), jnp.float32(features)
+    masked, weights = solve(reward, features, jnp.asarray(valid), jnp.float32(0.5))
+    subset, expected = solve_all(reward[valid], features[valid])
+    np.testing.assert_allclose(masked.temperature, subset.temperature, rtol=1e-4)
+    np.testing.assert_allclose(weights[valid], expected, rtol=1e-3, atol=1e-7)
+    assert np.all(weights[~valid] == 0)
+
+
+def test_vmap_equals_loop():
+    batches = [samples(seed) for seed in range(4)]
+    reward = jnp.stack([jnp.float32(batch[2]) for batch in batches])
+    features = jnp.stack([jnp.float32(batch[1]) for batch in batches])
+    valid = jnp.ones(reward.shape, bool)
+    bounds = jnp.float32([0.1, 0.5, 1.0, 50.0])
+    solutions, weights = jax.jit(jax.vmap(solve))(reward, features, valid, bounds)
+    for i in range(4):
+        alone, alone_weights = solve(reward[i], features[i], valid[i], bounds[i])
+        assert bool(solutions.is_active[i]) == bool(alone.is_active) == (i < 3)
+        rounding = 1e-3 if i < 3 else 0.1  # of the relative entropy of greedy weights, which sets the last
+        np.testing.assert_allclose(solutions.temperature[i], alone.temperature, rtol=rounding)
+        np.testing.assert_allclose(weights[i], alone_weights, atol=rounding / 10)
+
+
+def test_traced_once():
+    _, features, reward = samples()
+    solve_all(reward, features)
+    num_traces = len(TRACES)
+    solve_all(100 * reward, features, 0.1)
+    assert len(TRACES) == num_traces
+
+
+# What cannot be solved.
+
+
+@pytest.mark.parametrize("value", [0.0, 3.0, -1e9, 1e-9])
+def test_equal_rewards_give_equal_weights(value):
+    _, features, _ = samples()
+    solution, weights = solve_all(np.full(NUM, value), features)
+    assert_finite(solution, weights)
+    assert not bool(solution.is_active)
+    assert float(solution.temperature) > 0
+    np.testing.assert_allclose(weights, 1 / NUM, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kl_bound", [5.0, 50.0])
+def test_bound_out_of_reach_gives_nearly_greedy_weights_that_keep_the_features(kl_bound):
+    _, features, reward = samples()
+    solution, weights = solve_all(reward, features, kl_bound)
+    assert_finite(solution, weights)
+    assert not bool(solution.is_active)
+    assert float(solution.temperature) > 0
+    assert float(solution.grad_norm) < 3e-4
+    assert mismatch(weights, features) < 1e-4
+    # The greedy weights put everything on as few samples as can keep the mean of four free features.
+    assert 1 / np.sum(weights**2) < NUM_FEATURES + 1
+
+
+def test_constant_features_leave_the_best_sample_to_greed():
+    _, _, reward = samples()
+    solution, weights = solve_all(reward, np.ones((NUM, NUM_FEATURES)), 50.0)
+    assert not bool(solution.is_active)
+    assert weights.argmax() == reward.argmax()
+    assert weights.max() > 0.9
+
+
+@pytest.mark.parametrize("num_valid", [0, 1, 2, 3, 7, 30])
+def test_few_valid_samples_give_finite_answers(num_valid):
+    _, features, reward = samples()
+    valid = jnp.arange(NUM) < num_valid
+    solution, weights = solve(jnp.float32(reward), jnp.float32(features), valid, jnp.float32(0.5))
+    assert_finite(solution, weights)
+    assert float(solution.temperature) > 0
+    np.testing.assert_allclose(np.sum(weights), float(num_valid > 0), atol=1e-5)
+    assert np.all(np.asarray(weights)[num_valid:] == 0)
+    assert float(solution.grad_norm) < 1e-3
+
+
+def test_more_features_than_samples_give_finite_answers():
+    context, _, reward = samples()
+    features = radial(context, 20)
+    solution, weights = solve_all(reward[:12], features[:12])
+    assert_finite(solution, weights)
+    np.testing.assert_allclose(weights.sum(), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_samples_that_are_not_finite_do_not_count(bad):
+    _, features, reward = samples()
+    reward, features, valid = np.float32(reward), np.float32(features), np.arange(NUM) % 2 == 0
+    expected, expected_weights = solve(
+        jnp.asarray(reward), jnp.asarray(features), jnp.asarray(valid), jnp.float32(0.5)
+    )
+    hidden_reward, hidden_features = reward.copy(), features.copy()
+    hidden_reward[1::4] = bad
+    hidden_features[3::4] = bad
+    for mask in (valid, np.ones(NUM, bool)):
+        solution, weights = solve(
+            jnp.asarray(hidden_reward), jnp.asarray(hidden_features), jnp.asarray(mask), jnp.float32(0.5)
+        )
+        np.testing.assert_array_equal(solution.temperature, expected.temperature)
+        np.testing.assert_array_equal(weights, expected_weights)
+
+
+def test_no_finite_sample_gives_zero_weights():
+    _, features, _ = samples()
+    solution, weights = solve_all(np.full(NUM, np.nan), features)
+    assert_finite(solution)
+    assert np.all(weights == 0)
+
+
+def test_gradients_do_not_see_masked_samples():
+    _, features, reward = samples()
+    valid = jnp.arange(NUM) % 2 == 0
+    reward = jnp.where(valid, jnp.float32(reward), jnp.nan)
+    features = jnp.where(valid[:, None], jnp.float32(features), jnp.nan)
+    solution, _ = solve(reward, features, valid, jnp.float32(0.5))
+    coef = solution.baseline_coef
+    objective = partial(dual_objective, valid=valid, kl_bound=0.5)
+    by_all = jax.jit(jax.grad(objective, (0, 1, 2, 3)))(jnp.log(solution.temperature), coef, reward, features)
+    first_weight = jax.jit(jax.grad(lambda *args: sample_weights(solution, *args, valid)[0], (0, 1)))
+    by_weights = first_weight(reward, features)
+    assert_finite(by_all, by_weights)
+    # By the envelope theorem the derivative by the rewards is the weights.
+    np.testing.assert_allclose(by_all[2], sample_weights(solution, reward, features, valid), atol=1e-6)
+
+
+# The relative entropy.
+
+
+def test_sample_kl_is_that_of_float64():
+    rng = np.random.default_rng(6)
+    for spread in (1e-3, 1.0, 10.0):
+        weights = softmax(spread * rng.normal(size=NUM))
+        expected = dual_scipy.kl_to_uniform(np.float64(np.float32(weights)))
+        np.testing.assert_allclose(sample_kl(jnp.float32(weights)), expected, rtol=2e-3)
+
+
+def test_sample_kl_lies_between_zero_and_the_logarithm_of_the_count():
+    valid = jnp.arange(NUM) < 10
+    uniform = jnp.where(valid, 0.1, 0.0)
+    single = jnp.zeros(NUM).at[3].set(1.0)
+    np.testing.assert_allclose(sample_kl(uniform, valid), 0.0, atol=1e-7)
+    np.testing.assert_allclose(sample_kl(single, valid), np.log(10), rtol=1e-6)
+    assert float(sample_kl(jnp.zeros(NUM), jnp.zeros(NUM, bool))) == 0.0
+
+
+# Errors.
+
+
+@pytest.mark.parametrize("kl_bound", [0.0, -1.0, np.nan, np.inf])
+def test_bad_bound_is_named(kl_bound):
+    with pytest.raises(ValueError, match=f"kl_bound has to be a positive number, got {kl_bound}"):
+        solve_dual(jnp.zeros(3), jnp.zeros((3, 2)), kl_bound=kl_bound)
+
+
+@pytest.mark.parametrize(
+    ("reward", "features", "valid", "message"),
+    [
+        ((3,), (4, 2), (3,), r"got shapes \(3,\), \(4, 2\)"),
+        ((3, 1), (3, 2), (3,), r"got shapes \(3, 1\), \(3, 2\)"),
+        ((3,), (3,), (3,), r"got shapes \(3,\), \(3,\)"),
+        ((3,), (3, 0), (3,), r"got shapes \(3,\), \(3, 0\)"),
+        ((3,), (3, 2), (4,), r"the shape of reward, \(3,\), got \(4,\)"),
+    ],
+)
+def test_bad_shapes_are_named(reward, features, valid, message):
+    # Below the type checker of the tests, as a user meets it.
+    unchecked = inspect.unwrap(solve_dual)
+    with pytest.raises(ValueError, match=message):
+        unchecked(jnp.zeros(reward), jnp.zeros(features), jnp.ones(valid, bool), kl_bound=0.5)
