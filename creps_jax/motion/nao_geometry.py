@@ -1,0 +1,135 @@
+"""Hold the lengths, joint order and joint limits of the simulated NAO: their only home beside the model file.
+
+The robot is the RoboCup 3D simulation NAO of type 0; `models/nao/SOURCE.md` names the origin of each figure.
+Lengths are in metres in the torso's frame, x forward, y left, z up, origin in the centre of the torso, at the
+zero pose: legs straight, arms stretched forward. Angles are in radians.
+
+A side is a number, `LEFT = 1.0` or `RIGHT = -1.0`, the sign of y: mirroring multiplies by it, and functions
+of a side can be vmapped over both legs.
+"""
+
+from math import radians
+from typing import NamedTuple
+
+LEFT = 1.0
+RIGHT = -1.0
+
+
+class NaoGeometry(NamedTuple):
+    """List the lengths (m), for the left side; `_y` has the other sign on the right.
+
+    The three hip axes meet in one point. The knee lies `thigh_forward` ahead of the hip, and at the zero pose
+    so does the ankle. The ankle's two axes do not meet: roll is `ankle_drop` below pitch.
+
+    Attributes:
+        hip_x: Hip joints, from the torso's centre.
+        hip_y: The same, to the side.
+        hip_z: The same, upward.
+        thigh_forward: From hip to knee.
+        thigh_down: The same, downward.
+        shank_down: From knee to ankle pitch axis.
+        ankle_drop: From ankle pitch axis to ankle roll axis.
+        foot_down: From ankle roll axis to sole.
+        foot_front: From ankle to the front edge of the sole.
+        foot_back: From ankle to its rear edge, negative.
+        foot_half_width: From ankle to its side edges.
+        shoulder_y: Shoulder joints, from the torso's centre.
+        shoulder_z: The same, upward.
+        elbow_forward: From shoulder to elbow, the arm stretched forward.
+        elbow_up: The same, upward.
+        neck_z: Neck, from the torso's centre.
+        head_pitch_z: Head pitch axis, from the torso's centre.
+    """
+
+    hip_x: float = -0.010
+    hip_y: float = 0.055
+    hip_z: float = -0.115
+    thigh_forward: float = 0.005
+    thigh_down: float = 0.120
+    shank_down: float = 0.100
+    ankle_drop: float = 0.005
+    foot_down: float = 0.045
+    foot_front: float = 0.110
+    foot_back: float = -0.050
+    foot_half_width: float = 0.040
+    shoulder_y: float = 0.098
+    shoulder_z: float = 0.075
+    elbow_forward: float = 0.090
+    elbow_up: float = 0.009
+    neck_z: float = 0.090
+    head_pitch_z: float = 0.150
+
+    @property
+    def ankle_height(self) -> float:
+        """Height of the ankle pitch axis above the sole."""
+        return self.ankle_drop + self.foot_down
+
+    @property
+    def torso_height(self) -> float:
+        """Height of the torso centre above the sole at the zero pose."""
+        return -self.hip_z + self.thigh_down + self.shank_down + self.ankle_height
+
+
+GEOMETRY = NaoGeometry()
+
+_HEAD = ("head_yaw", "head_pitch")
+_ARM = ("shoulder_pitch", "shoulder_yaw", "arm_roll", "elbow")
+_LEG = ("hip_yaw_pitch", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
+
+JOINT_NAMES: tuple[str, ...] = (
+    *_HEAD,
+    *(f"{side}_{joint}" for part in (_ARM, _LEG) for side in ("left", "right") for joint in part),
+)
+"""The order of every joint vector: head 2, left arm 4, right arm 4, left leg 6, right leg 6."""
+
+NUM_JOINTS = len(JOINT_NAMES)
+
+# Degrees, in the order above, with the simulator's signs: positive hip pitch swings the leg forward, the knee
+# bends with a negative angle, positive ankle pitch lifts the toes, positive shoulder pitch lifts the arm (at
+# -90 it hangs), positive head pitch looks up, roll and yaw are right-handed about x and z. A negative hip
+# yaw-pitch turns the toes out and swings the leg forward.
+_HEAD_RANGES = ((-120.0, 120.0), (-45.0, 45.0))
+_LEFT_ARM_RANGES = ((-120.0, 120.0), (-1.0, 95.0), (-120.0, 120.0), (-90.0, 1.0))
+_RIGHT_ARM_RANGES = ((-120.0, 120.0), (-95.0, 1.0), (-120.0, 120.0), (-1.0, 90.0))
+_LEFT_LEG_RANGES = ((-90.0, 1.0), (-25.0, 45.0), (-25.0, 100.0), (-130.0, 1.0), (-45.0, 75.0), (-45.0, 25.0))
+_RIGHT_LEG_RANGES = ((-90.0, 1.0), (-45.0, 25.0), (-25.0, 100.0), (-130.0, 1.0), (-45.0, 75.0), (-25.0, 45.0))
+_RANGES = _HEAD_RANGES + _LEFT_ARM_RANGES + _RIGHT_ARM_RANGES + _LEFT_LEG_RANGES + _RIGHT_LEG_RANGES
+
+JOINT_LOWER: tuple[float, ...] = tuple(radians(low) for low, _ in _RANGES)
+"""Lower joint limits (rad)."""
+
+JOINT_UPPER: tuple[float, ...] = tuple(radians(high) for _, high in _RANGES)
+"""Upper joint limits (rad)."""
+
+MAX_JOINT_SPEED = radians(351.77)
+"""Largest speed of every joint (rad/s)."""
+
+MAX_JOINT_TORQUE = 10.0
+"""Largest torque of every motor (N m)."""
+
+
+def leg_indices(side: float | int) -> slice:
+    """Return where a leg's six joints lie in a joint vector (or in `JOINT_NAMES`), for `LEFT` or `RIGHT`.
+
+    Raises:
+        ValueError: `side` is neither `LEFT` nor `RIGHT`.
+    """
+    start = len(_HEAD) + 2 * len(_ARM) + _side_index(side) * len(_LEG)
+    return slice(start, start + len(_LEG))
+
+
+def arm_indices(side: float | int) -> slice:
+    """Return where an arm's four joints lie in a joint vector (or in `JOINT_NAMES`), for `LEFT` or `RIGHT`.
+
+    Raises:
+        ValueError: `side` is neither `LEFT` nor `RIGHT`.
+    """
+    start = len(_HEAD) + _side_index(side) * len(_ARM)
+    return slice(start, start + len(_ARM))
+
+
+def _side_index(side: float | int) -> int:
+    """Return 0 for the left and 1 for the right side."""
+    if side not in (LEFT, RIGHT):
+        raise ValueError(f"side must be LEFT ({LEFT}) or RIGHT ({RIGHT}), got {side!r}")
+    return 0 if side == LEFT else 1
