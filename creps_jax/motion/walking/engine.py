@@ -1,0 +1,236 @@
+"""Turn walking parameters into joint targets: plan a step, pose the body at a time, pose the joints for the measured lean."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from creps_jax.curves import smooth_step
+from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_UPPER, LEFT, RIGHT
+from creps_jax.motion.nao_kinematics import leg_ik
+from creps_jax.motion.walking.com import com_trajectory, spring_height
+from creps_jax.motion.walking.footsteps import Footstep, Stance, next_footstep, standing
+from creps_jax.motion.walking.params import WalkParams
+from creps_jax.motion.walking.posture import corrected_lean
+from creps_jax.motion.walking.swing import swing_pose
+from creps_jax.motion.walking.zmp import zmp_reference
+from creps_jax.rotations import rigid_transform, rotation_y, rotation_x, rotation_z
+from creps_jax.typing import Array, Float, Scalar, ScalarLike
+
+__all__ = ["BodyPose", "StepPlan", "body_pose", "joint_targets", "plan_step", "plan_walk", "pose_joints"]
+
+NUM_NODES = 33
+# Height of the CoM above the middle of the hips, and of the ankle above the floor, m.
+_COM_ABOVE_HIP = 0.025
+# The foot's "centre", where the ZMP is to be, lies ahead of the ankle by this much, m; the CoM is planned above it.
+_CENTRE_AHEAD_OF_ANKLE = 0.02
+# ... and the CoM is ahead of the hips by this much, m.
+_COM_AHEAD_OF_HIP = 0.01
+# Swing of the shoulders against the legs, rad for each metre that the other foot is ahead, and the arms' posture, rad.
+_ARM_SWING = 5.0
+_SHOULDER_PITCH = -1.6
+_SHOULDER_YAW = 0.1
+_ARM_ROLL = 1.57
+_ELBOW = 0.6
+_MAX_HEADING_STEP = 0.15
+
+
+class StepPlan(NamedTuple):
+    """All that is planned of one step.
+
+    Attributes:
+        footstep: Where the feet are and go.
+        com: Horizontal CoM position at equally spaced nodes over the step, in the world, m.
+        yaw: Heading of the trunk at the start and the end of the step, rad.
+    """
+
+    footstep: Footstep
+    com: Float[Array, "n 2"]
+    yaw: Float[Array, "2"]
+
+
+class BodyPose(NamedTuple):
+    """Where hips and feet shall be at one time, in the world (m, rad).
+
+    Attributes:
+        hips: Position (x, y, z) and yaw of the middle of the hips.
+        left: Position (x, y, z) and yaw of the left sole, below the ankle.
+        right: That of the right sole.
+        turn: Share of a turn of the trunk in the coming step by which the left foot is turned outwards already; the right
+            foot by the opposite.
+    """
+
+    hips: Float[Array, "4"]
+    left: Float[Array, "4"]
+    right: Float[Array, "4"]
+    turn: Scalar
+
+
+def plan_step(params: WalkParams, stance: Stance, command: Float[Array, "3"]) -> tuple[StepPlan, Stance]:
+    """Plan one step: footstep, ZMP reference, CoM trajectory.
+
+    Args:
+        params: Walking parameters.
+        stance: Where the feet stand.
+        command: Wanted displacement (x forward, y left, yaw) of the body in one step, m and rad.
+
+    Returns:
+        The plan of the step, and the stance after it.
+
+    Source: Abdolmaleki et al. 2016, Section 2.
+    """
+    footstep, after = next_footstep(params, stance, command)
+    start, end = stance.body, after.body
+    phase = jnp.linspace(0.0, 1.0, NUM_NODES, dtype=command.dtype)
+    share = params.double_support / params.step_duration
+    zmp = zmp_reference(phase, start[:2], footstep.support[:2], end[:2], share)
+    height, height_acc = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
+    com_height = height + (GEOMETRY.ankle_height + _COM_ABOVE_HIP)
+    solve = jax.vmap(com_trajectory, in_axes=(1, None, None, 0, 0, None), out_axes=1)
+    com = solve(zmp, com_height, height_acc, start[:2], end[:2], params.step_duration)
+    return StepPlan(footstep, com, jnp.stack([start[2], end[2]])), after
+
+
+def plan_walk(params: WalkParams, num_steps: int, command: Float[Array, "3"] | None = None) -> StepPlan:
+    """Plan a walk from standstill.
+
+    Args:
+        params: Walking parameters.
+        num_steps: Number of steps.
+        command: Wanted displacement of the body in one step; straight ahead by `params.step_length` if left out.
+
+    Returns:
+        The plans of the steps, stacked along a leading axis.
+    """
+    dtype = params.step_length.dtype
+    if command is None:
+        command = params.step_length * jnp.array([1.0, 0.0, 0.0], dtype)
+
+    def plan_next(stance, _):
+        plan, after = plan_step(params, stance, command)
+        return after, plan
+
+    return lax.scan(plan_next, standing(dtype), length=num_steps)[1]
+
+
+def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
+    """Pose hips and feet at one time of a step.
+
+    Args:
+        params: Walking parameters.
+        plan: The plan of the step.
+        phase: Time over the duration of the step, 0 to 1.
+
+    Returns:
+        The pose of hips and feet.
+    """
+    phase = jnp.clip(phase, 0.0, 1.0)
+    share = params.double_support / params.step_duration
+    swing_phase = (phase - 0.5 * share) / (1.0 - share)
+    swing, lift = swing_pose(
+        plan.footstep.swing_start, plan.footstep.swing_end, params.swing_height, swing_phase
+    )
+    swing, support = _above_floor(swing, lift), _above_floor(plan.footstep.support, jnp.zeros_like(lift))
+
+    node = phase * (plan.com.shape[0] - 1)
+    index = jnp.minimum(node.astype(jnp.int32), plan.com.shape[0] - 2)
+    remainder = node - index.astype(node.dtype)
+    com = (1.0 - remainder) * plan.com[index] + remainder * plan.com[index + 1]
+    height, _ = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
+    turned = smooth_step(phase)
+    yaw = (1.0 - turned) * plan.yaw[0] + turned * plan.yaw[1]
+    forward = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
+    hips = com - _COM_AHEAD_OF_HIP * forward
+    supports_left = plan.footstep.supports_left
+    return BodyPose(
+        hips=jnp.concatenate([hips, jnp.stack([height + GEOMETRY.ankle_height, yaw])]),
+        left=jnp.where(supports_left, support, swing),
+        right=jnp.where(supports_left, swing, support),
+        turn=jnp.where(supports_left, 0.5 - turned, turned - 0.5),
+    )
+
+
+def _above_floor(foot, height):
+    """Position and yaw of the sole below the ankle, from the planar pose of the foot's centre and its height."""
+    x, y, yaw = foot
+    back = _CENTRE_AHEAD_OF_ANKLE
+    return jnp.stack([x - back * jnp.cos(yaw), y - back * jnp.sin(yaw), height, yaw])
+
+
+def pose_joints(
+    params: WalkParams, pose: BodyPose, measured_rpy: Float[Array, "3"], *, heading_gain: ScalarLike = 0.0
+) -> Float[Array, "22"]:
+    """Pose the joints for a body pose and the measured orientation of the trunk.
+
+    Args:
+        params: Walking parameters.
+        pose: Where hips and feet shall be.
+        measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw relative to the planned heading's origin.
+        heading_gain: Share of the heading error that one step turns back; 0 is the paper's engine, which leaves the heading
+            alone.
+
+    Returns:
+        Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad, within the joint limits.
+    """
+    intended = jnp.stack([jnp.zeros_like(params.lean), params.lean])
+    roll, pitch = corrected_lean(intended, measured_rpy[:2], params.roll_gain, params.tilt_gain)
+    R_level_trunk = rotation_y(pitch) @ rotation_x(roll)
+    heading_error = jnp.clip(pose.hips[3] - measured_rpy[2], -1.0, 1.0)
+    turn = jnp.clip(heading_gain * heading_error, -_MAX_HEADING_STEP, _MAX_HEADING_STEP) * pose.turn
+    left = leg_ik(_sole_in_torso(pose.hips, pose.left, R_level_trunk, turn), LEFT)
+    right = leg_ik(_sole_in_torso(pose.hips, pose.right, R_level_trunk, -turn), RIGHT)
+    ahead = jnp.cos(pose.hips[3]) * (pose.left[0] - pose.right[0]) + jnp.sin(pose.hips[3]) * (
+        pose.left[1] - pose.right[1]
+    )
+    targets = jnp.concatenate([_head_and_arms(0.5 * ahead), left, right])
+    return jnp.clip(targets, jnp.asarray(JOINT_LOWER, targets.dtype), jnp.asarray(JOINT_UPPER, targets.dtype))
+
+
+def _sole_in_torso(hips, sole, R_level_trunk, turn):
+    """Transform a sole from the world into the frame of a trunk that leans about the middle of its hips."""
+    R_trunk_level = R_level_trunk.T
+    R_heading = rotation_z(turn - hips[3])
+    hip_centre = jnp.array([GEOMETRY.hip_x, 0.0, GEOMETRY.hip_z], hips.dtype)
+    position = R_trunk_level @ R_heading @ (sole[:3] - hips[:3]) + hip_centre
+    return rigid_transform(R_trunk_level @ R_heading @ rotation_z(sole[3]), position)
+
+
+def _head_and_arms(left_foot_ahead):
+    """Hold the head still and swing each arm against the foot of its side."""
+    swing = _ARM_SWING * left_foot_ahead
+    left = [_SHOULDER_PITCH - swing, _SHOULDER_YAW, -_ARM_ROLL, -_ELBOW]
+    right = [_SHOULDER_PITCH + swing, -_SHOULDER_YAW, _ARM_ROLL, _ELBOW]
+    return jnp.stack([jnp.asarray(angle, left_foot_ahead.dtype) for angle in [0.0, 0.0, *left, *right]])
+
+
+def joint_targets(
+    params: WalkParams,
+    plans: StepPlan,
+    time: Scalar,
+    measured_rpy: Float[Array, "3"],
+    *,
+    heading_gain: ScalarLike = 0.0,
+) -> Float[Array, "22"]:
+    """Return the joint targets of a planned walk at a time.
+
+    Args:
+        params: Walking parameters.
+        plans: Plans of the steps, stacked (see `plan_walk`).
+        time: Time since the start of the first step, s; after the last step the robot holds its last pose.
+        measured_rpy: Measured roll, pitch and yaw of the trunk, rad.
+        heading_gain: See `pose_joints`.
+
+    Returns:
+        Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad.
+    """
+    return pose_joints(params, pose_at(params, plans, time), measured_rpy, heading_gain=heading_gain)
+
+
+def pose_at(params: WalkParams, plans: StepPlan, time: Scalar) -> BodyPose:
+    """Return the body pose of a planned walk at a time (see `joint_targets`)."""
+    num_steps = plans.yaw.shape[0]
+    steps = time / params.step_duration
+    index = jnp.clip(jnp.floor(steps), 0.0, num_steps - 1.0)
+    plan = jax.tree.map(lambda leaf: leaf[index.astype(jnp.int32)], plans)
+    return body_pose(params, plan, steps - index)

@@ -1,0 +1,122 @@
+"""Name the ten walking parameters, with units and bounds, and turn a parameter vector into safe settings of the engine."""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from creps_jax.typing import Array, Float, Scalar
+
+__all__ = [
+    "GRAVITY",
+    "NAO_BOUNDS",
+    "PAPER_BOUNDS",
+    "PARAM_LABELS",
+    "PARAM_NAMES",
+    "PARAM_UNITS",
+    "WalkParams",
+    "params_from_theta",
+]
+
+GRAVITY = 9.81
+
+# The paper's order (Table 1); the names are the fields of WalkParams.
+PARAM_NAMES = (
+    "amplitude",
+    "hip_height",
+    "swing_height",
+    "step_duration",
+    "lean",
+    "tilt_gain",
+    "roll_gain",
+    "step_length",
+    "double_support",
+    "step_growth",
+)
+PARAM_LABELS = (
+    "A",
+    "x0",
+    "z_step",
+    "T",
+    "r_offset",
+    "gamma_tilt",
+    "gamma_roll",
+    "x_step",
+    "phi_DSP",
+    "sigma_step",
+)
+PARAM_UNITS = ("m", "m", "m", "s", "deg", "", "", "m", "s", "m/s")
+
+# Section 4.3.1, as printed: (lower, upper).
+PAPER_BOUNDS = (
+    (0.0, 0.16, 0.02, 0.1, 0.0, 0.0, 0.0, 0.05, 0.0, 0.0),
+    (1.0, 0.22, 0.15, 3.0, 5.0, 1.0, 1.0, 0.5, 1.0, 0.5),
+)
+# The part of that box in which a NAO can walk at all, with room for slow walking (step length from 0) and leaning back.
+NAO_BOUNDS = (
+    (0.0, 0.15, 0.02, 0.14, -5.0, 0.0, 0.0, 0.0, 0.0, 0.02),
+    (0.01, 0.20, 0.06, 0.40, 5.0, 1.0, 1.0, 0.15, 0.1, 0.2),
+)
+
+# What the engine accepts, whatever theta says. Within it every plan is finite.
+_SAFE_LOW = (0.0, 0.10, 0.0, 0.08, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
+_SAFE_HIGH = (1.0, 0.22, 0.15, 4.0, 30.0, 2.0, 2.0, 0.2, 4.0, 10.0)
+# Amplitude at which the spring's acceleration would reach that of gravity is A = g T^2 / (4 pi^2): there the ZMP equation is
+# singular. Share of it that is allowed.
+_MAX_AMPLITUDE_SHARE = 0.6
+_MAX_AMPLITUDE = 0.05
+# Share of a step that double support may fill; the swing foot needs the rest.
+_MAX_DOUBLE_SUPPORT_SHARE = 0.6
+
+
+class WalkParams(NamedTuple):
+    """Settings of the walking engine, in SI units, safe to plan with.
+
+    Attributes:
+        amplitude: A, oscillation amplitude of the spring, m.
+        hip_height: x0, rest height of the hip above the ankle, m.
+        swing_height: z_step, greatest height of the swing foot above the floor, m.
+        step_duration: T, duration of one step, s.
+        lean: r_offset, forward lean (pitch) of the trunk, rad.
+        tilt_gain: gamma_tilt, share of the pitch error that is corrected.
+        roll_gain: gamma_roll, share of the roll error that is corrected.
+        step_length: x_step, forward displacement of the CoM in one step, m.
+        double_support: phi_DSP, part of a step during which both feet stand, s.
+        step_growth: sigma_step, rate at which the step length grows from standstill, m/s.
+
+    Source: Abdolmaleki et al. 2016, Table 1.
+    """
+
+    amplitude: Scalar
+    hip_height: Scalar
+    swing_height: Scalar
+    step_duration: Scalar
+    lean: Scalar
+    tilt_gain: Scalar
+    roll_gain: Scalar
+    step_length: Scalar
+    double_support: Scalar
+    step_growth: Scalar
+
+
+def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
+    """Turn a parameter vector in the paper's order and units into settings that the engine can plan with.
+
+    Any finite theta is accepted: each entry is limited to what gives a finite plan. The amplitude is limited to a share of
+    `g T^2 / (4 pi^2)`, where the ZMP equation turns singular, and double support to a share of the step.
+
+    Args:
+        theta: Parameters in the order of `PARAM_NAMES` and the units of `PARAM_UNITS` (the lean in degrees).
+
+    Returns:
+        The settings, in SI units.
+    """
+    safe = jnp.clip(theta, jnp.asarray(_SAFE_LOW, theta.dtype), jnp.asarray(_SAFE_HIGH, theta.dtype))
+    params = WalkParams(*safe)
+    duration = params.step_duration
+    highest = jnp.minimum(_MAX_AMPLITUDE_SHARE * GRAVITY * duration**2 / (4.0 * math.pi**2), _MAX_AMPLITUDE)
+    return params._replace(
+        amplitude=jnp.minimum(params.amplitude, highest),
+        lean=params.lean * (math.pi / 180.0),
+        double_support=jnp.minimum(params.double_support, _MAX_DOUBLE_SUPPORT_SHARE * duration),
+    )
