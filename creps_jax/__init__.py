@@ -1,0 +1,67 @@
+"""Contextual relative entropy policy search in JAX, and a humanoid that learns to walk with it."""
+
+from typing import TYPE_CHECKING, Any
+
+from creps_jax import tasks
+from creps_jax.archive import Archive, Batch
+from creps_jax.constraints import sigmoid_gate, sigmoid_gate_inverse
+from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
+from creps_jax.creps import Creps, CrepsInfo, CrepsState, creps
+from creps_jax.dual import DualSolution, sample_weights, solve_dual
+from creps_jax.features import FeatureMap, linear_features, quadratic_features, rbf_features
+from creps_jax.linalg import thomas_solve
+from creps_jax.motion.nao_kinematics import leg_fk, leg_ik
+from creps_jax.motion.walking.com import com_trajectory
+from creps_jax.policy import LinearGaussian, fit_weighted_ml
+from creps_jax.tasks import Outcome, Task, average_repeats, penalised, sigmoid_constrained, sinus
+from creps_jax.train import IterationLog, evaluate, make_iteration, train, train_trials
+
+if TYPE_CHECKING:
+    from creps_jax.tasks import nao_walk
+
+__all__ = [
+    "Archive",
+    "Batch",
+    "Creps",
+    "CrepsInfo",
+    "CrepsState",
+    "DualSolution",
+    "FeatureMap",
+    "IterationLog",
+    "LinearGaussian",
+    "Outcome",
+    "Task",
+    "average_repeats",
+    "com_trajectory",
+    "context_grid",
+    "creps",
+    "evaluate",
+    "fit_weighted_ml",
+    "gaussian_contexts",
+    "leg_fk",
+    "leg_ik",
+    "linear_features",
+    "make_iteration",
+    "nao_walk",
+    "penalised",
+    "quadratic_features",
+    "rbf_features",
+    "sample_weights",
+    "sigmoid_constrained",
+    "sigmoid_gate",
+    "sigmoid_gate_inverse",
+    "sinus",
+    "solve_dual",
+    "tasks",
+    "thomas_solve",
+    "train",
+    "train_trials",
+    "uniform_contexts",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # The walking task imports MuJoCo, which nothing else needs.
+    if name == "nao_walk":
+        return tasks.nao_walk
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,81 @@
+"""Keep parameters inside a box: by squashing them into it, or by a price for leaving it."""
+
+import jax
+import jax.numpy as jnp
+
+from creps_jax.typing import Array, Float, ScalarLike, VectorLike
+
+__all__ = ["penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
+
+
+def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) -> Float[Array, "*b d"]:
+    """Squash free parameters into a box.
+
+    Args:
+        theta: Free parameters, any real numbers.
+        low: Lower bounds, in the units of the result.
+        high: Upper bounds; a parameter whose bounds are equal is fixed at them.
+
+    Returns:
+        Parameters in [low, high]; zero goes to the middle of the box.
+
+    Raises:
+        ValueError: If there is neither one bound nor one for each parameter.
+
+    Source: Abdolmaleki et al. 2016, Eq. 17.
+    """
+    low, high = _box(theta, low, high)
+    # The clip takes back the last bit that rounding can put outside the box.
+    return jnp.clip(low + jax.nn.sigmoid(theta) * (high - low), low, high)
+
+
+def sigmoid_gate_inverse(
+    theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike
+) -> Float[Array, "*b d"]:
+    """Find the free parameters that `sigmoid_gate` squashes to the given ones.
+
+    Args:
+        theta: Parameters inside the box; outside it they count as at the nearest bound.
+        low: Lower bounds.
+        high: Upper bounds.
+
+    Returns:
+        Free parameters. A parameter at a bound, which only infinity reaches, gets the last finite
+        value that float32 tells from the bound (about 16); a fixed parameter gets zero.
+
+    Raises:
+        ValueError: If there is neither one bound nor one for each parameter.
+    """
+    low, high = _box(theta, low, high)
+    is_free = high > low
+    fraction = jnp.where(is_free, (theta - low) / jnp.where(is_free, high - low, 1.0), 0.5)
+    margin = float(jnp.finfo(theta.dtype).epsneg)
+    return jax.scipy.special.logit(jnp.clip(fraction, margin, 1.0 - margin))
+
+
+def violation(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) -> Float[Array, "*b d"]:
+    """Measure how far each parameter lies outside its bounds: zero inside, positive outside.
+
+    Raises:
+        ValueError: If there is neither one bound nor one for each parameter.
+    """
+    low, high = _box(theta, low, high)
+    return jnp.maximum(jnp.maximum(low - theta, theta - high), 0.0)
+
+
+def penalty(violation: Float[Array, "*b c"], size: ScalarLike) -> Float[Array, "*b"]:
+    """Charge `size` where any constraint is violated, however little.
+
+    Source: Abdolmaleki et al. 2016, Eq. 18 (its last term).
+    """
+    is_violated = jnp.any(violation > 0.0, axis=-1)
+    return jnp.where(is_violated, jnp.asarray(size, violation.dtype), jnp.zeros((), violation.dtype))
+
+
+def _box(theta: Array, low: VectorLike, high: VectorLike) -> tuple[Array, Array]:
+    low, high = jnp.asarray(low, theta.dtype), jnp.asarray(high, theta.dtype)
+    if not {low.shape, high.shape} <= {(), theta.shape[-1:]}:
+        raise ValueError(
+            f"bounds must be numbers or vectors of {theta.shape[-1]}, got shapes {low.shape} and {high.shape}"
+        )
+    return jnp.broadcast_to(low, theta.shape), jnp.broadcast_to(high, theta.shape)

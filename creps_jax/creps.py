@@ -1,0 +1,222 @@
+"""Contextual relative entropy policy search: ask for parameters, try them, tell the rewards.
+
+The algorithm knows nothing of tasks. Whoever measures the rewards, a simulator or a person with a
+robot, calls `ask`, measures, and calls `tell`; `creps_jax.train` does so for a simulated task.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+
+from creps_jax import policy as gaussian
+from creps_jax.archive import Archive, Batch, empty_archive, push, valid
+from creps_jax.dual import DualSolution, sample_kl, sample_weights, solve_dual
+from creps_jax.features import FeatureMap
+from creps_jax.linalg import exact_dot
+from creps_jax.policy import LinearGaussian
+from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar
+
+__all__ = ["Creps", "CrepsInfo", "CrepsState", "creps"]
+
+
+class CrepsState(NamedTuple):
+    """What the next step needs: all of it, so that a saved state resumes a run exactly."""
+
+    policy: LinearGaussian
+    archive: Archive
+    iteration: IntScalar
+    """How many batches have been told."""
+
+
+class CrepsInfo(NamedTuple):
+    """How an update went; only a reader needs it."""
+
+    dual: DualSolution
+    kl: Scalar
+    """Relative entropy between the weights and uniform weights, in nats; the KL bound limits it."""
+    policy_kl: Scalar
+    """KL(new policy || old policy) in nats, the mean over the archived contexts. The bound is on
+    the weighted samples: with few of them the fitted Gaussian moves farther, with many old ones less."""
+    effective_samples: Scalar
+    """1 / sum of squared weights: how many equally weighted samples carry as much information."""
+    entropy: Scalar
+    """Differential entropy of the new policy, in nats."""
+    num_valid: IntScalar
+    """How many archived samples the update was made from; those that are not finite are left out."""
+    is_updated: Bool[Array, ""]
+    """False where the policy was kept, because there were too few samples to fit one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Creps:
+    """The algorithm as a record of pure functions, closed over and never traced.
+
+    All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters.
+
+    Attributes:
+        init: (policy) -> state, with an empty archive.
+        ask: (key, state, contexts (n, s)) -> thetas (n, d), drawn from the policy.
+        tell: (state, batch) -> (state, info): archive the batch, fit a new policy to the archive. A
+            sample that holds NaN or infinity, such as a measurement that failed, takes its place in the
+            archive and is then ignored. The policy is kept until the archive holds as many valid
+            samples as the policy has features and parameters, p + d: fewer leave the covariance singular.
+        mean: (policy, contexts (n, s)) -> thetas (n, d), the policy without its exploration.
+    """
+
+    init: Callable[[LinearGaussian], CrepsState]
+    ask: Callable[[PRNGKey, CrepsState, ArrayLike], Array]
+    tell: Callable[[CrepsState, Batch], tuple[CrepsState, CrepsInfo]]
+    mean: Callable[[LinearGaussian, ArrayLike], Array]
+
+
+def creps(
+    policy_features: FeatureMap,
+    baseline_features: FeatureMap,
+    *,
+    kl_bound: float | int = 0.5,
+    archive_size: int,
+    ridge: float | int = 1e-4,
+) -> Creps:
+    """Set up contextual relative entropy policy search.
+
+    Args:
+        policy_features: Features varphi(s) that the policy's mean is linear in.
+        baseline_features: Features phi(s) whose expectations over the contexts are kept.
+        kl_bound: Largest relative entropy epsilon of one update, in nats.
+        archive_size: Number L of the last samples that are learned from.
+        ridge: Penalty on the policy's coefficients, relative to the mean square of each feature.
+
+    Returns:
+        The functions `init`, `ask`, `tell` and `mean`. These raise ValueError, showing what they
+        got and what they expected, if shapes do not fit the features or the policy.
+
+    Raises:
+        ValueError: If a setting is out of its range, or the features are of different contexts.
+
+    Source: Abdolmaleki et al. 2016, Section 3.1.
+    """
+    _check_settings(policy_features, baseline_features, kl_bound, archive_size, ridge)
+    context_dim = policy_features.context_dim
+
+    def init(policy: LinearGaussian) -> CrepsState:
+        theta_dim = _checked_theta_dim(policy, policy_features)
+        archive = empty_archive(archive_size, context_dim, theta_dim)
+        policy = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), policy)
+        return CrepsState(policy, archive, iteration=jnp.zeros((), jnp.int32))
+
+    def ask(key: PRNGKey, state: CrepsState, contexts: ArrayLike) -> Float[Array, "n d"]:
+        contexts = _checked("contexts", contexts, ("n", context_dim))
+        keys = jax.random.split(key, contexts.shape[0])
+        features = jax.vmap(policy_features.apply)(contexts)
+        return jax.vmap(gaussian.sample, (0, None, 0))(keys, state.policy, features)
+
+    def tell(state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
+        archive = push(state.archive, _checked_batch(batch, state.archive))
+        is_valid = valid(archive)
+        # What is left out must not enter: 0 * nan is not 0.
+        samples = jax.tree.map(lambda x: jnp.where(_along(is_valid, x), x, 0.0), archive.batch)
+
+        baseline = jax.vmap(baseline_features.apply)(samples.context)
+        dual = solve_dual(samples.reward, baseline, is_valid, kl_bound=kl_bound)  # Eq. (13)
+        weights = sample_weights(dual, samples.reward, baseline, is_valid)
+        features = jax.vmap(policy_features.apply)(samples.context)
+        fitted = gaussian.fit_weighted_ml(features, samples.theta, weights, ridge=ridge)  # Eq. (14), (15)
+
+        num_valid = jnp.sum(is_valid, dtype=jnp.int32)
+        is_finite = jnp.all(jnp.isfinite(fitted.coef)) & jnp.all(jnp.isfinite(fitted.cov_chol))
+        is_updated = is_finite & (num_valid >= sum(state.policy.coef.shape))
+        policy = jax.tree.map(lambda new, old: jnp.where(is_updated, new, old), fitted, state.policy)
+
+        info = CrepsInfo(
+            dual=dual,
+            kl=sample_kl(weights, is_valid),
+            policy_kl=_mean_kl(policy, state.policy, features, is_valid),
+            effective_samples=_effective_samples(weights),
+            entropy=gaussian.entropy(policy),
+            num_valid=num_valid,
+            is_updated=is_updated,
+        )
+        return CrepsState(policy, archive, state.iteration + 1), info
+
+    def mean(policy: LinearGaussian, contexts: ArrayLike) -> Float[Array, "n d"]:
+        contexts = _checked("contexts", contexts, ("n", context_dim))
+        features = jax.vmap(policy_features.apply)(contexts)
+        return jax.vmap(gaussian.mean, (None, 0))(policy, features)
+
+    return Creps(init, ask, tell, mean)
+
+
+def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array, is_valid: Array) -> Scalar:
+    """Average `policy.kl` over contexts; only the shift of the mean depends on the context."""
+    without_shift = gaussian.kl(policy, reference, jnp.zeros_like(features[0]))
+    change = (policy.coef - reference.coef).T
+    whitened = jax.scipy.linalg.solve_triangular(reference.cov_chol, change, lower=True)
+    shifts = exact_dot(features, whitened.T)
+    count = jnp.maximum(jnp.sum(is_valid, dtype=jnp.float32), 1.0)
+    return without_shift + 0.5 * jnp.sum(shifts**2, where=is_valid[:, None]) / count
+
+
+def _effective_samples(weights: Array) -> Scalar:
+    squares = jnp.sum(weights**2)
+    return jnp.where(squares > 0, 1.0 / jnp.where(squares > 0, squares, 1.0), 0.0)
+
+
+def _along(mask: Array, array: Array) -> Array:
+    """Give a mask of samples the number of axes of an array of samples."""
+    return mask.reshape(mask.shape + (1,) * (array.ndim - 1))
+
+
+def _checked(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Array:
+    """Return an array of float32 after comparing its shape; a letter stands for any number above zero."""
+    array = jnp.asarray(value, jnp.float32)
+    fits = len(array.shape) == len(shape) and all(
+        got == expected or (isinstance(expected, str) and got > 0)
+        for got, expected in zip(array.shape, shape, strict=True)
+    )
+    if not fits:
+        expected = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+        raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    return array
+
+
+def _checked_batch(batch: Batch, archive: Archive) -> Batch:
+    reward = _checked("batch.reward", batch.reward, ("n",))
+    num, context_dim = reward.shape[0], archive.batch.context.shape[1]
+    context = _checked("batch.context", batch.context, (num, context_dim))
+    theta = _checked("batch.theta", batch.theta, (num, archive.batch.theta.shape[1]))
+    return Batch(context, theta, reward)
+
+
+def _checked_theta_dim(policy: LinearGaussian, policy_features: FeatureMap) -> int:
+    coef_shape, cov_shape = jnp.shape(policy.coef), jnp.shape(policy.cov_chol)
+    if len(coef_shape) != 2 or coef_shape[0] != policy_features.size or cov_shape != (coef_shape[1],) * 2:
+        raise ValueError(
+            f"the policy must have coef ({policy_features.size}, d), a row for each of the policy features, "
+            f"and cov_chol (d, d), got {coef_shape} and {cov_shape}"
+        )
+    return coef_shape[1]
+
+
+def _check_settings(
+    policy_features: FeatureMap,
+    baseline_features: FeatureMap,
+    kl_bound: float | int,
+    archive_size: int,
+    ridge: float | int,
+) -> None:
+    if policy_features.context_dim != baseline_features.context_dim:
+        raise ValueError(
+            "policy and baseline features must be of the same context, got "
+            f"{policy_features.context_dim} and {baseline_features.context_dim} variables"
+        )
+    if not (kl_bound > 0 and math.isfinite(kl_bound)):
+        raise ValueError(f"kl_bound must be positive and finite, got {kl_bound}")
+    if archive_size < 1:
+        raise ValueError(f"archive_size must be at least 1, got {archive_size}")
+    if not (ridge >= 0 and math.isfinite(ridge)):
+        raise ValueError(f"ridge must be finite and not negative, got {ridge}")

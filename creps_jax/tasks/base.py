@@ -1,0 +1,164 @@
+"""What a task is, and wrappers from task to task.
+
+A task knows nothing of learning: it draws contexts and turns (key, context, theta) into an
+outcome. Everything is written for one rollout; the caller vmaps.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from creps_jax import constraints
+from creps_jax.typing import Array, Float, PRNGKey, VectorLike
+
+__all__ = ["Outcome", "PlainOutcome", "Task", "average_repeats", "penalised", "sigmoid_constrained"]
+
+
+@runtime_checkable
+class Outcome(Protocol):
+    """What a rollout brings back: a NamedTuple of arrays with at least these two fields.
+
+    A task returns a NamedTuple of its own and may add fields (speed, whether the robot fell);
+    wrappers and the training loop carry them along.
+    """
+
+    @property
+    def reward(self) -> Float[Array, "*b"]:
+        """The reward to maximise."""
+        ...
+
+    @property
+    def violation(self) -> Float[Array, "*b c"]:
+        """How far each constraint on theta is violated, zero where it holds; c is 0 without any."""
+        ...
+
+    def _replace(self, **fields: Any) -> Any: ...
+
+
+class PlainOutcome(NamedTuple):
+    """The outcome of a task that has nothing to add."""
+
+    reward: Float[Array, ""]
+    violation: Float[Array, " c"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A contextual task: a record of pure functions, closed over and never traced.
+
+    Attributes:
+        sample_context: (key) -> context (s,).
+        rollout: (key, context (s,), theta (d,)) -> outcome of one rollout.
+        context_dim: s.
+        theta_dim: d.
+        worst_reward: The finite reward put in place of one that is not finite.
+    """
+
+    sample_context: Callable[[PRNGKey], Array]
+    rollout: Callable[[PRNGKey, Array, Array], Any]
+    context_dim: int
+    theta_dim: int
+    worst_reward: float | int
+
+
+def average_repeats(task: Task, repeats: int) -> Task:
+    """Average every rollout over repeats with keys of their own (Abdolmaleki et al. 2016, 4.3.1).
+
+    Args:
+        task: The task to repeat.
+        repeats: How often a rollout is repeated, at least 1.
+
+    Returns:
+        A task whose outcome is the mean of each field over the repeats; booleans and integers
+        become the float fraction or mean. One repeat that is not finite makes the mean so.
+
+    Raises:
+        ValueError: If repeats < 1.
+    """
+    if repeats < 1:
+        raise ValueError(f"repeats must be at least 1, got {repeats}")
+
+    def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
+        keys = jax.random.split(key, repeats)
+        outcomes = jax.vmap(task.rollout, in_axes=(0, None, None))(keys, context, theta)
+        return jax.tree.map(_mean_of_repeats, outcomes)
+
+    return dataclasses.replace(task, rollout=rollout)
+
+
+def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
+    """Let theta be free and squash it into [low, high] (Abdolmaleki et al. 2016, Eq. 17).
+
+    Args:
+        task: A task whose theta has bounds.
+        low: Lower bounds (d,), in the units of the task's theta.
+        high: Upper bounds (d,).
+
+    Returns:
+        A task of the same size whose theta is any vector of real numbers.
+
+    Raises:
+        ValueError: If the bounds do not fit the task or each other.
+    """
+    low, high = _checked_bounds(task, low, high)
+
+    def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
+        gated = constraints.sigmoid_gate(theta, low, high)
+        return task.rollout(key, context, gated)
+
+    return dataclasses.replace(task, rollout=rollout)
+
+
+def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | int) -> Task:
+    """Charge a penalty where theta leaves [low, high] (the 1_p of Abdolmaleki et al. 2016, Eq. 18).
+
+    The rollout itself is run at theta clipped to the box, so that a parameter without a
+    meaning (a negative duration) never reaches the task.
+
+    Args:
+        task: A task whose theta has bounds.
+        low: Lower bounds (d,), in the units of the task's theta.
+        high: Upper bounds (d,).
+        penalty: Taken from the reward if any bound is violated, by however little.
+
+    Returns:
+        A task of the same size whose outcome carries the violation of each bound, and whose
+        worst reward includes the penalty.
+
+    Raises:
+        ValueError: If the bounds do not fit the task or each other, or the penalty is negative.
+    """
+    low, high = _checked_bounds(task, low, high)
+    if not penalty >= 0:
+        raise ValueError(f"penalty must not be negative, got {penalty}")
+
+    def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
+        violation = constraints.violation(theta, low, high)
+        outcome = task.rollout(key, context, jnp.clip(theta, low, high))
+        return outcome._replace(
+            reward=outcome.reward - constraints.penalty(violation, penalty), violation=violation
+        )
+
+    return dataclasses.replace(task, rollout=rollout, worst_reward=task.worst_reward - penalty)
+
+
+def _mean_of_repeats(field: Array) -> Array:
+    is_float = jnp.issubdtype(field.dtype, jnp.floating)
+    return jnp.mean(field if is_float else field.astype(jnp.float32), axis=0)
+
+
+def _checked_bounds(task: Task, low: VectorLike, high: VectorLike) -> tuple[np.ndarray, np.ndarray]:
+    low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+    shape = (task.theta_dim,)
+    if not {low.shape, high.shape} <= {(), shape}:
+        raise ValueError(
+            f"bounds must be numbers or one for each of the task's {task.theta_dim} parameters, "
+            f"got shapes {low.shape} and {high.shape}"
+        )
+    if not np.all(low <= high):
+        raise ValueError(f"lower bounds must not exceed upper bounds, got {low} and {high}")
+    return np.broadcast_to(low, shape), np.broadcast_to(high, shape)

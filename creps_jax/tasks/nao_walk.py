@@ -1,0 +1,296 @@
+"""The walking task: a simulated NAO walks straight ahead from standstill at the speed that the context asks for."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from jax import lax
+
+from creps_jax.contexts import gaussian_contexts
+from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, MAX_JOINT_SPEED, NUM_JOINTS
+from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints
+from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, params_from_theta
+from creps_jax.physics.mjx import RobotState, initial_state, make_control_step
+from creps_jax.rotations import quat_to_matrix, matrix_to_rpy, rotation_y, rpy_to_quat
+from creps_jax.tasks.base import Task
+from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
+
+__all__ = ["WalkNoise", "WalkOutcome", "WalkRecord", "WalkReward", "load_nao", "nao_walk", "record_walk"]
+
+CONTROL_PERIOD = 0.02
+# The torso centre stands .315 m high with the knees bent most; upright means within 50 degrees of it.
+_FALLEN_HEIGHT = 0.2
+_FALLEN_COSINE = 0.64
+# The shortest step the plan has to provide for, see `params_from_theta`.
+_SHORTEST_STEP = 0.08
+
+
+class WalkReward(NamedTuple):
+    """Weights of the reward, `-speed (vx - s)^2 - drift vy^2 - fall [fell]` (Abdolmaleki et al. 2016, Eq. 18)."""
+
+    speed: float = 10.0
+    drift: float = 1.0
+    fall: float = 100.0
+
+
+class WalkNoise(NamedTuple):
+    """Standard deviations of the noise: measured roll, pitch and yaw, set-points, and joints at the start; rad."""
+
+    lean: float = 0.01
+    set_point: float = 0.01
+    start: float = 0.01
+
+
+class WalkOutcome(NamedTuple):
+    """What a walk brings.
+
+    Attributes:
+        reward: Eq. 18.
+        violation: Empty; the wrappers fill it.
+        fell: Whether the robot fell.
+        speed: Forward and leftward speed over the measured time, m/s.
+        seconds: Simulated time, s.
+    """
+
+    reward: Float[Array, ""]
+    violation: Float[Array, " c"]
+    fell: Bool[Array, ""]
+    speed: Float[Array, "2"]
+    seconds: Float[Array, ""]
+
+
+class WalkRecord(NamedTuple):
+    """A walk, control step by control step (leading axis n).
+
+    Attributes:
+        time: Time, s.
+        qpos: Generalised positions of the robot, m and rad.
+        set_point: Set-points of the servos, rad.
+        pose: Planned pose of hips and feet.
+        has_fallen: Whether the robot has fallen by then.
+    """
+
+    time: Float[Array, " n"]
+    qpos: Float[Array, "n nq"]
+    set_point: Float[Array, "n nu"]
+    pose: BodyPose
+    has_fallen: Bool[Array, " n"]
+
+
+class _Walk(NamedTuple):
+    """A walk before its first control step: state, and all that the controller will need."""
+
+    robot: RobotState
+    set_point: Array
+    params: WalkParams
+    poses: BodyPose
+    lean_noise: Array
+    set_point_noise: Array
+
+
+class _Progress(NamedTuple):
+    """What goes round the loop."""
+
+    tick: Array
+    robot: RobotState
+    set_point: Array
+    measured_from: Array
+    has_fallen: Array
+
+
+def load_nao() -> mujoco.MjModel:
+    """Load the NAO for simulation, from the checkout or from the installed package.
+
+    What is only there to be looked at is left out. So are the joint limits' constraints, a third of all constraint rows: the
+    set-points keep within the limits, and the servos hold the joints near them.
+
+    Raises:
+        FileNotFoundError: If the model file is in neither place.
+    """
+    package = Path(__file__).resolve().parents[1]
+    folders = (package.parent / "models", package / "models")
+    for folder in folders:
+        path = folder / "nao" / "nao.xml"
+        if path.is_file():
+            spec = mujoco.MjSpec.from_file(str(path))
+            spec.compiler.discardvisual = True
+            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+            return spec.compile()
+    raise FileNotFoundError(f"nao/nao.xml is in none of {', '.join(map(str, folders))}")
+
+
+def nao_walk(
+    low: float = 0.1,
+    high: float = 0.6,
+    *,
+    sample_context: Callable[[PRNGKey], Array] | None = None,
+    duration: float = 8.0,
+    start_up: float = 2.0,
+    reward: WalkReward = WalkReward(),
+    noise: WalkNoise = WalkNoise(),
+    heading_gain: float = 0.0,
+    model: mujoco.MjModel | None = None,
+) -> Task:
+    """Make the walking task: context the asked speed (m/s), theta the ten walking parameters in the paper's order and units.
+
+    The robot starts from standstill and walks straight ahead. Its speed is the displacement of the torso, in the frame of the
+    start, over the time from the end of the start-up to the end of the episode. A fall ends the episode, and the speed up to
+    it counts.
+
+    Args:
+        low: Lowest speed that is asked for, m/s.
+        high: Highest speed that is asked for, m/s.
+        sample_context: (key) -> speed (1,); by default Gaussian about the middle, clipped to the range.
+        duration: Length of the episode, s.
+        start_up: Length of the time at its start over which the speed does not count, s.
+        reward: Weights of the reward.
+        noise: Sizes of the noise.
+        heading_gain: Share of the heading error that a step turns back; 0 is the paper's engine.
+        model: The robot; by default `load_nao()`.
+
+    Returns:
+        The task. Its rollout is for one robot; vmap it for a batch.
+
+    Raises:
+        ValueError: If the range or the times are not in order, or the model is not driven by the NAO's joints.
+
+    Source: Abdolmaleki et al. 2016, Section 4.3.
+    """
+    if not 0 <= start_up < duration:
+        raise ValueError(
+            f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
+        )
+    sample_context = gaussian_contexts(low, high, clip=True) if sample_context is None else sample_context
+    begin, advance = _make_walker(model, duration, noise, heading_gain)
+    num_ticks = round(duration / CONTROL_PERIOD)
+    start_up_ticks = round(start_up / CONTROL_PERIOD)
+
+    def rollout(key: PRNGKey, context: Float[Array, "1"], theta: Float[Array, "10"]) -> WalkOutcome:
+        walk = begin(key, theta)
+        start = _Progress(jnp.int32(0), walk.robot, walk.set_point, walk.robot.qpos[:2], jnp.asarray(False))
+
+        def is_walking(progress):
+            return (progress.tick < num_ticks) & ~progress.has_fallen
+
+        def step(progress):
+            robot, set_point = advance(walk, progress.tick, progress.robot, progress.set_point)
+            tick = progress.tick + 1
+            measured_from = jnp.where(tick <= start_up_ticks, robot.qpos[:2], progress.measured_from)
+            return _Progress(tick, robot, set_point, measured_from, _has_fallen(robot.qpos))
+
+        end = lax.while_loop(is_walking, step, start)
+        measured = jnp.maximum(end.tick - start_up_ticks, 1).astype(theta.dtype) * CONTROL_PERIOD
+        speed = (end.robot.qpos[:2] - end.measured_from) / measured
+        value = -reward.speed * (speed[0] - context[0]) ** 2 - reward.drift * speed[1] ** 2
+        value = value - reward.fall * end.has_fallen.astype(theta.dtype)
+        seconds = end.tick.astype(theta.dtype) * CONTROL_PERIOD
+        return WalkOutcome(value, jnp.zeros(0, theta.dtype), end.has_fallen, speed, seconds)
+
+    # A fall at twice the highest speed in the wrong direction.
+    worst = -(reward.fall + reward.speed * (3.0 * high) ** 2)
+    return Task(sample_context, rollout, context_dim=1, theta_dim=len(PARAM_NAMES), worst_reward=worst)
+
+
+def record_walk(
+    key: PRNGKey,
+    theta: Float[Array, "10"],
+    *,
+    duration: float = 8.0,
+    noise: WalkNoise = WalkNoise(),
+    heading_gain: float = 0.0,
+    model: mujoco.MjModel | None = None,
+) -> WalkRecord:
+    """Walk as `nao_walk` does and keep every control step, beyond a fall too.
+
+    Args:
+        key: Random key; with the key of a rollout it is the same walk.
+        theta: Walking parameters in the paper's order and units.
+        duration: Length of the episode, s.
+        noise: Sizes of the noise.
+        heading_gain: See `nao_walk`.
+        model: The robot; by default `load_nao()`.
+
+    Returns:
+        The walk.
+    """
+    begin, advance = _make_walker(model, duration, noise, heading_gain)
+    walk = begin(key, theta)
+
+    def step(carry, tick):
+        robot, set_point, has_fallen = carry
+        robot, set_point = advance(walk, tick, robot, set_point)
+        has_fallen = has_fallen | _has_fallen(robot.qpos)
+        return (robot, set_point, has_fallen), (robot.qpos, set_point, has_fallen)
+
+    ticks = jnp.arange(round(duration / CONTROL_PERIOD), dtype=jnp.int32)
+    _, (qpos, set_point, has_fallen) = lax.scan(step, (walk.robot, walk.set_point, jnp.asarray(False)), ticks)
+    return WalkRecord(
+        (ticks + 1).astype(theta.dtype) * CONTROL_PERIOD, qpos, set_point, walk.poses, has_fallen
+    )
+
+
+def _make_walker(model, duration, noise, heading_gain):
+    """Return `begin(key, theta)` and `advance(walk, tick, robot, set_point)`, shared by rollout and record."""
+    model = load_nao() if model is None else model
+    _check_model(model)
+    control_step = make_control_step(model, round(CONTROL_PERIOD / model.opt.timestep))
+    num_ticks = round(duration / CONTROL_PERIOD)
+    num_steps = round(duration / _SHORTEST_STEP) + 1
+
+    def begin(key: PRNGKey, theta: Array) -> _Walk:
+        start_key, lean_key, set_point_key = jax.random.split(key, 3)
+        params = params_from_theta(theta)
+        plans = plan_walk(params, num_steps)
+        first = pose_at(params, plans, jnp.zeros_like(params.lean))
+        upright = jnp.stack([jnp.zeros_like(params.lean), params.lean, jnp.zeros_like(params.lean)])
+        set_point = pose_joints(params, first, upright)
+        joints = set_point + noise.start * jax.random.normal(start_key, (NUM_JOINTS,), theta.dtype)
+        robot = initial_state(jnp.concatenate([_torso_over(first, params.lean), joints]), model.nv)
+        times = jnp.arange(1, num_ticks + 1, dtype=theta.dtype) * CONTROL_PERIOD
+        poses = jax.vmap(lambda time: pose_at(params, plans, time))(times)
+        lean_noise = noise.lean * jax.random.normal(lean_key, (num_ticks, 3), theta.dtype)
+        set_point_noise = noise.set_point * jax.random.normal(
+            set_point_key, (num_ticks, NUM_JOINTS), theta.dtype
+        )
+        return _Walk(robot, set_point, params, poses, lean_noise, set_point_noise)
+
+    def advance(walk: _Walk, tick: Array, robot: RobotState, set_point: Array) -> tuple[RobotState, Array]:
+        pose, lean_noise, set_point_noise = jax.tree.map(
+            lambda leaf: leaf[tick], (walk.poses, walk.lean_noise, walk.set_point_noise)
+        )
+        measured = matrix_to_rpy(quat_to_matrix(robot.qpos[3:7])) + lean_noise
+        target = pose_joints(walk.params, pose, measured, heading_gain=heading_gain) + set_point_noise
+        slew = MAX_JOINT_SPEED * CONTROL_PERIOD
+        target = set_point + jnp.clip(target - set_point, -slew, slew)
+        return control_step(robot, set_point, target), target
+
+    return begin, advance
+
+
+def _torso_over(pose: BodyPose, lean: Scalar) -> Array:
+    """Return the position and quaternion of a torso that leans over the hips of a pose."""
+    hip_centre = jnp.array([GEOMETRY.hip_x, 0.0, GEOMETRY.hip_z], lean.dtype)
+    position = pose.hips[:3] - rotation_y(lean) @ hip_centre
+    zero = jnp.zeros_like(lean)
+    return jnp.concatenate([position, rpy_to_quat(jnp.stack([zero, lean, zero]))])
+
+
+def _has_fallen(qpos: Array) -> Array:
+    """Say whether the torso is low or far from upright; a state that is not finite counts as fallen."""
+    stands = (qpos[2] > _FALLEN_HEIGHT) & (quat_to_matrix(qpos[3:7])[2, 2] > _FALLEN_COSINE)
+    return ~stands
+
+
+def _check_model(model: mujoco.MjModel) -> None:
+    """Refuse a model whose actuators are not the NAO's joints in order, or whose steps do not divide a control step."""
+    names = tuple(model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu))
+    if names != JOINT_NAMES:
+        raise ValueError(f"the model's actuators must drive {JOINT_NAMES} in this order, got {names}")
+    ratio = CONTROL_PERIOD / model.opt.timestep
+    if abs(ratio - round(ratio)) > 1e-6:
+        raise ValueError(
+            f"the control step of {CONTROL_PERIOD} s is no multiple of the time step {model.opt.timestep} s"
+        )

@@ -1,0 +1,351 @@
+"""Where the algorithm meets the task: one compiled iteration, runs and trials of it, evaluation.
+
+Every random number of a run follows from its key and the number of the iteration, so that a scan, a
+loop and a resumed run draw the same ones. Rollouts are shared out over the devices.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Key, UInt32
+
+from creps_jax.archive import Batch
+from creps_jax.creps import Creps, CrepsInfo, CrepsState
+from creps_jax.policy import LinearGaussian
+from creps_jax.tasks.base import Task
+from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
+
+__all__ = ["IterationLog", "evaluate", "make_iteration", "train", "train_trials"]
+
+Devices = Sequence[jax.Device] | None
+OnIteration = Callable[[CrepsState, "IterationLog"], Any]
+
+
+class IterationLog(NamedTuple):
+    """What happened in an iteration; only a reader needs it."""
+
+    info: CrepsInfo
+    mean_reward: Scalar
+    """Mean reward of the new samples, failed ones included."""
+    num_failed: IntScalar
+    """Number of new samples whose reward was not finite and was replaced by the task's worst."""
+    outcome: Any
+    """Mean of each field of the task's outcome over the new samples that did not fail: of a boolean
+    the fraction. NaN if all failed."""
+
+
+def make_iteration(
+    task: Task, algorithm: Creps, *, samples: int, devices: Devices = None
+) -> Callable[[PRNGKey, CrepsState], tuple[CrepsState, IterationLog]]:
+    """Make one iteration: sample contexts and parameters, roll out, archive, dual, weighted fit.
+
+    Args:
+        task: What to learn.
+        algorithm: What learns it.
+        samples: Number of new samples.
+        devices: Devices that share the rollouts, by default all local ones. Nothing that is drawn
+            depends on them.
+
+    Returns:
+        A compiled function (key, state) -> (state, log). The key is that of the whole run, the same in
+        every iteration: the iteration's own is `fold_in(key, state.iteration)`. The function may be
+        scanned, and vmapped over keys and states. It raises ValueError if the state does not fit
+        the task.
+
+    Raises:
+        ValueError: If `samples` is less than 1 or there are no devices.
+
+    Source: Abdolmaleki et al. 2016, Algorithm 1.
+    """
+    setup = _make_setup(task, algorithm, samples, devices)
+    return lambda key, state: _iterate(setup, key, _replicate(state, setup.devices))
+
+
+def train(
+    key: PRNGKey,
+    task: Task,
+    algorithm: Creps,
+    start: LinearGaussian | CrepsState,
+    *,
+    iterations: int,
+    samples: int,
+    first_samples: int | None = None,
+    on_iteration: OnIteration | None = None,
+    devices: Devices = None,
+) -> tuple[CrepsState, IterationLog]:
+    """Run iterations of learning, from a first policy or on from a state.
+
+    Args:
+        key: Key of the run. To resume a run, give the key it began with.
+        task: What to learn.
+        algorithm: What learns it.
+        start: The policy to begin with, or the state to go on from.
+        iterations: Number of iterations to run now.
+        samples: Number of new samples of each iteration.
+        first_samples: Number of new samples of the very first iteration of a run, if it differs.
+        on_iteration: Called on the host as (state, log) after each iteration, for progress and
+            checkpoints. Without it all iterations are one `lax.scan`, with the same numbers.
+        devices: Devices that share the rollouts, by default all local ones.
+
+    Returns:
+        The last state, and the logs stacked along a first axis of `iterations`.
+
+    Raises:
+        ValueError: If a number is less than 1, or the state does not fit task or features.
+    """
+    state = start if isinstance(start, CrepsState) else algorithm.init(start)
+    phases = _phases(task, algorithm, state, iterations, samples, first_samples, devices)
+    state, logs = _run(_iterate, phases, key, state, on_iteration)
+    return state, jax.tree.map(jnp.asarray, logs)
+
+
+def train_trials(
+    keys: Key[Array, " trials"] | UInt32[Array, "trials 2"],
+    task: Task,
+    algorithm: Creps,
+    start: LinearGaussian | CrepsState,
+    *,
+    iterations: int,
+    samples: int,
+    first_samples: int | None = None,
+    on_iteration: OnIteration | None = None,
+    devices: Devices = None,
+) -> tuple[CrepsState, IterationLog]:
+    """Run several trials of `train` at once; the rollouts of all of them are one batch.
+
+    Args:
+        keys: Key of each trial.
+        task: What to learn.
+        algorithm: What learns it.
+        start: The policy that every trial begins with, or the states (trials, ...) to go on from.
+        iterations: Number of iterations to run now.
+        samples: Number of new samples of each iteration of each trial.
+        first_samples: Number of new samples of the very first iteration, if it differs.
+        on_iteration: As in `train`; state and log have a first axis of trials.
+        devices: Devices that share the rollouts, by default all local ones.
+
+    Returns:
+        The last states (trials, ...), and the logs (trials, iterations, ...).
+
+    Raises:
+        ValueError: As in `train`, and if there is not one state for each key.
+    """
+    num_trials = keys.shape[0]
+    if isinstance(start, CrepsState):
+        states = start
+    else:
+        first = algorithm.init(start)
+        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_trials, *x.shape)), first)
+    if states.iteration.shape != (num_trials,):
+        raise ValueError(f"one state is needed for each of {num_trials} keys, got {states.iteration.shape}")
+    phases = _phases(task, algorithm, states, iterations, samples, first_samples, devices)
+    states, logs = _run(_iterate_trials, phases, keys, states, on_iteration)
+    return states, jax.tree.map(lambda x: jnp.asarray(np.swapaxes(x, 0, 1)), logs)
+
+
+def evaluate(
+    key: PRNGKey,
+    task: Task,
+    contexts: Float[Array, "n s"],
+    thetas: Float[Array, "n d"],
+    *,
+    repeats: int = 1,
+    devices: Devices = None,
+) -> Any:
+    """Roll out given parameters, such as `algorithm.mean(policy, contexts)`, with fresh seeds.
+
+    Args:
+        key: Random key; every rollout gets its own.
+        task: The task.
+        contexts: One context for each row of `thetas`.
+        thetas: Parameters to try.
+        repeats: Number of rollouts of each row.
+        devices: Devices that share the rollouts, by default all local ones.
+
+    Returns:
+        The task's outcome with leading axes (n, repeats); rewards that were not finite are the
+        task's worst.
+
+    Raises:
+        ValueError: If a shape does not fit the task, or `repeats` is less than 1.
+    """
+    if repeats < 1:
+        raise ValueError(f"repeats must be at least 1, got {repeats}")
+    num = contexts.shape[0]
+    if contexts.shape != (num, task.context_dim) or thetas.shape != (num, task.theta_dim) or num == 0:
+        raise ValueError(
+            f"the task takes contexts (n, {task.context_dim}) and thetas (n, {task.theta_dim}), "
+            f"got {contexts.shape} and {thetas.shape}"
+        )
+    contexts, thetas = (jnp.repeat(x, repeats, axis=0) for x in (contexts, thetas))
+    outcomes, _ = _roll_out(task, _as_tuple(devices), key, contexts, thetas)
+    return jax.tree.map(lambda x: x.reshape(num, repeats, *x.shape[1:]), outcomes)
+
+
+class _Setup(NamedTuple):
+    """What an iteration is compiled for; hashable, so that equal setups share one compilation."""
+
+    task: Task
+    algorithm: Creps
+    samples: int
+    devices: tuple[jax.Device, ...]
+
+
+def _make_setup(task: Task, algorithm: Creps, samples: int, devices: Devices) -> _Setup:
+    if samples < 1:
+        raise ValueError(f"samples must be at least 1, got {samples}")
+    return _Setup(task, algorithm, samples, _as_tuple(devices))
+
+
+def _as_tuple(devices: Devices) -> tuple[jax.Device, ...]:
+    devices = tuple(jax.local_devices() if devices is None else devices)
+    if not devices:
+        raise ValueError("devices must hold at least one device, got none")
+    return devices
+
+
+@partial(jax.jit, static_argnums=0)
+def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
+    task, algorithm, samples, devices = setup
+    _check_fit(task, state)
+    # The barriers keep the compiler from fusing an iteration with what surrounds it, which rounds
+    # differently in a scan and on its own.
+    key, state = lax.optimization_barrier((key, state))
+    context_key, theta_key, rollout_key = jax.random.split(jax.random.fold_in(key, state.iteration), 3)
+    contexts = jax.vmap(task.sample_context)(jax.random.split(context_key, samples))
+    if contexts.shape != (samples, task.context_dim):
+        raise ValueError(f"sample_context must give ({task.context_dim},), got {contexts.shape[1:]}")
+    thetas = algorithm.ask(theta_key, state, contexts)
+    outcomes, is_failed = _roll_out(task, devices, rollout_key, contexts, thetas)
+    state, info = algorithm.tell(state, Batch(contexts, thetas, outcomes.reward))
+    log = IterationLog(
+        info=info,
+        mean_reward=jnp.mean(outcomes.reward),
+        num_failed=jnp.sum(is_failed, dtype=jnp.int32),
+        outcome=_mean_outcome(outcomes, ~is_failed),
+    )
+    return lax.optimization_barrier((state, log))
+
+
+@partial(jax.jit, static_argnums=0)
+def _iterate_trials(setup: _Setup, keys: Array, states: CrepsState) -> tuple[CrepsState, IterationLog]:
+    return jax.vmap(partial(_iterate, setup))(keys, states)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _scan(iterate: Callable, setup: _Setup, length: int, key: Array, state: CrepsState):
+    return lax.scan(lambda state, _: iterate(setup, key, state), state, length=length)
+
+
+def _phases(
+    task: Task,
+    algorithm: Creps,
+    state: CrepsState,
+    iterations: int,
+    samples: int,
+    first_samples: int | None,
+    devices: Devices,
+) -> list[tuple[_Setup, int]]:
+    """List with how many samples to run how many iterations."""
+    if iterations < 1:
+        raise ValueError(f"iterations must be at least 1, got {iterations}")
+    ordinary = _make_setup(task, algorithm, samples, devices)
+    is_begun = np.any(np.asarray(state.iteration) > 0)
+    if first_samples is None or is_begun:
+        return [(ordinary, iterations)]
+    if first_samples < 1:
+        raise ValueError(f"first_samples must be at least 1, got {first_samples}")
+    phases = [(ordinary._replace(samples=first_samples), 1), (ordinary, iterations - 1)]
+    return [(setup, length) for setup, length in phases if length > 0]
+
+
+def _run(
+    iterate: Callable,
+    phases: list[tuple[_Setup, int]],
+    key: Array,
+    state: CrepsState,
+    on_iteration: OnIteration | None,
+) -> tuple[CrepsState, IterationLog]:
+    """Run all phases, as scans or as loops; return the logs on the host, stacked along a first axis."""
+    state, logs = _replicate(state, phases[0][0].devices), []
+    for setup, length in phases:
+        if on_iteration is None and length > 1:
+            state, log = _scan(iterate, setup, length, key, state)
+            logs.append(jax.device_get(log))
+            continue
+        for _ in range(length):
+            state, log = iterate(setup, key, state)
+            logs.append(jax.tree.map(lambda x: x[None], jax.device_get(log)))
+            if on_iteration is not None:
+                on_iteration(state, log)
+    return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def _roll_out(
+    task: Task, devices: tuple[jax.Device, ...], key: Array, contexts: Array, thetas: Array
+) -> tuple[Any, Array]:
+    """Roll out a batch over the devices; return outcomes with finite rewards, and which ones failed."""
+    num = contexts.shape[0]
+    # Keys go by the number of the rollout, whatever device it runs on.
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
+    rollouts = jax.vmap(task.rollout)
+    if len(devices) > 1:
+        rollouts = _shared_out(rollouts, devices)
+    outcomes = rollouts(keys, contexts, thetas)
+    if outcomes.reward.shape != (num,):
+        raise ValueError(f"a rollout must give one reward, got shape {outcomes.reward.shape[1:]}")
+    is_failed = ~jnp.isfinite(outcomes.reward)
+    reward = jnp.where(is_failed, jnp.float32(task.worst_reward), outcomes.reward.astype(jnp.float32))
+    return outcomes._replace(reward=reward), is_failed
+
+
+def _shared_out(function: Callable, devices: tuple[jax.Device, ...]) -> Callable:
+    """Share the rows of a batch out over devices; the last row fills up what does not divide."""
+    mesh = Mesh(np.asarray(devices), ("rollouts",))
+    rows = PartitionSpec("rollouts")
+    # Unchecked, so that a rollout may start its loops from constants, as it may on one device.
+    sharded = jax.shard_map(function, mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False)
+
+    def shared_out(*batch: Array) -> Any:
+        num = batch[0].shape[0]
+        padded = -(-num // len(devices)) * len(devices)
+        index = jnp.minimum(jnp.arange(padded), num - 1)
+        results = sharded(*(x[index] for x in batch))
+        # Every device goes on with all results: the update is small, and equal on each of them.
+        results = lax.with_sharding_constraint(results, NamedSharding(mesh, PartitionSpec()))
+        return jax.tree.map(lambda x: x[:num], results)
+
+    return shared_out
+
+
+def _replicate(state: CrepsState, devices: tuple[jax.Device, ...]) -> CrepsState:
+    """Put a state where the first iteration will leave it, lest the second be compiled anew."""
+    if len(devices) == 1:
+        return state
+    mesh = Mesh(np.asarray(devices), ("rollouts",))
+    return jax.device_put(state, NamedSharding(mesh, PartitionSpec()))
+
+
+def _mean_outcome(outcomes: Any, is_counted: Array) -> Any:
+    def mean(field: Array) -> Array:
+        mask = is_counted.reshape(is_counted.shape + (1,) * (field.ndim - 1))
+        return jnp.mean(field.astype(jnp.float32), axis=0, where=mask)
+
+    return jax.tree.map(mean, outcomes)
+
+
+def _check_fit(task: Task, state: CrepsState) -> None:
+    theta_dim, context_dim = state.policy.coef.shape[1], state.archive.batch.context.shape[1]
+    if theta_dim != task.theta_dim:
+        raise ValueError(f"the policy gives {theta_dim} parameters, the task takes {task.theta_dim}")
+    if context_dim != task.context_dim:
+        raise ValueError(
+            f"the features take {context_dim} context variables, the task has {task.context_dim}"
+        )

@@ -1,0 +1,89 @@
+"""Compare the speed of walking rollouts: all devices, one device, and bare C MuJoCo at the same solver setting.
+
+    python -m experiments.benchmarks.rollouts
+
+Each round runs all three in turn; the ratios are medians over the rounds. Ours have the controller in the loop; C MuJoCo replays
+the set-points of such a walk with `mujoco.rollout`, one thread a core.
+"""
+
+from experiments.process import import_mjx_quietly, prepare, usable_cores
+
+prepare()
+import_mjx_quietly()
+
+import time  # noqa: E402
+from collections.abc import Callable  # noqa: E402
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import mujoco  # noqa: E402
+import mujoco.rollout  # noqa: E402
+import numpy as np  # noqa: E402
+
+from creps_jax.tasks.nao_walk import CONTROL_PERIOD, load_nao, nao_walk, record_walk  # noqa: E402
+from creps_jax.train import evaluate  # noqa: E402
+
+BATCH = 96
+DURATION = 2.0
+ROUNDS = 5
+# A gait of about .33 m/s.
+THETA = (0.001, 0.176, 0.039, 0.224, 3.2, 0.46, 0.31, 0.074, 0.038, 0.11)
+
+
+def main() -> None:
+    """Measure and print."""
+    model, cores = load_nao(), usable_cores()
+    contestants = {
+        "all devices": _ours(jax.devices()),
+        "one device": _ours(jax.devices()[:1]),
+        "C MuJoCo": _bare_c(model, cores),
+    }
+    for run in contestants.values():
+        run()
+    steps = BATCH * round(DURATION / model.opt.timestep)
+    rates = {name: [] for name in contestants}
+    for _ in range(ROUNDS):
+        for name, run in contestants.items():
+            begin = time.perf_counter()
+            run()
+            rates[name].append(steps / (time.perf_counter() - begin))
+    print(f"{cores} cores, {jax.device_count()} devices, batch {BATCH}, {ROUNDS} rounds; physics steps a second, median:")
+    for name, values in rates.items():
+        print(f"  {name:12} {np.median(values):10,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
+    ours = np.array(rates["all devices"])
+    for name in ("one device", "C MuJoCo"):
+        print(f"all devices / {name}: {np.median(ours / np.array(rates[name])):.2f}")
+
+
+def _ours(devices: list[jax.Device]) -> Callable[[], None]:
+    task = nao_walk(duration=DURATION, start_up=0.5, heading_gain=0.3)
+    contexts, thetas = jnp.full((BATCH, 1), 0.3), jnp.tile(jnp.array(THETA), (BATCH, 1))
+
+    def run() -> None:
+        jax.block_until_ready(evaluate(jax.random.key(0), task, contexts, thetas, devices=devices))
+
+    return run
+
+
+def _bare_c(model: mujoco.MjModel, threads: int) -> Callable[[], None]:
+    record = jax.jit(lambda key: record_walk(key, jnp.array(THETA), duration=DURATION, heading_gain=0.3))
+    walk = jax.tree.map(np.asarray, record(jax.random.key(0)))
+    data = [mujoco.MjData(model) for _ in range(threads)]
+    data[0].qpos[:] = walk.qpos[0]
+    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    state = np.empty(size)
+    mujoco.mj_getState(model, data[0], state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    substeps = round(CONTROL_PERIOD / model.opt.timestep)
+    shares = np.arange(1, substeps + 1)[:, None] / substeps
+    before = np.concatenate([walk.set_point[:1], walk.set_point[:-1]])[:, None]
+    control = (before + shares * (walk.set_point[:, None] - before)).reshape(-1, model.nu)
+
+    def run() -> None:
+        states, controls = np.tile(state, (BATCH, 1)), np.tile(control, (BATCH, 1, 1))
+        mujoco.rollout.rollout(model, data, states, controls)
+
+    return run
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""Read the command line: `python -m experiments list | run NAME | plot NAME | check | video`.
+
+Nothing heavy is imported before it is clear that it is needed: help and mistakes are answered at once.
+"""
+
+import dataclasses
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
+
+from experiments import registry
+from experiments.errors import UserError
+from experiments.process import import_mjx_quietly
+
+OVERVIEW = """\
+Learn, plot and check what the project can do.
+
+  python -m experiments list                      the experiments by name
+  python -m experiments run walk --preset quick   learn to walk, a few minutes
+  python -m experiments run walk --speed 0.3      show the learned walk at a speed, in m/s
+  python -m experiments run walk --resume         go on with the latest unfinished run
+  python -m experiments plot walk                 draw the figures of the latest results again
+  python -m experiments check                     hold the latest results against the paper
+  python -m experiments video                     film a policy at several speeds
+
+Results go to results/. Add --help to any of these for all its options.
+"""
+
+
+# Options that are left out are described in words, not as "None".
+_Name = Annotated[str, arg(metavar="NAME")]
+_Names = Annotated[tuple[str, ...], arg(metavar="[NAME ...]", help_behavior_hint="")]
+_Text = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
+_Integer = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
+_Number = Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")]
+_File = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="")]
+
+
+@dataclasses.dataclass(frozen=True)
+class List:
+    """List the experiments by name."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Run an experiment; `python -m experiments list` names them.
+
+    Attributes:
+        name: The experiment.
+        preset: How thoroughly: quick, paper or best; each experiment's first one by default.
+        iterations: Iterations of learning, in place of the preset's.
+        trials: Trials with random keys of their own, in place of the preset's.
+        seed: Seed of all random numbers; 0 by default.
+        out: Result folder; a new one in results/ by default.
+        resume: Go on with the run in the folder --out, or with the latest unfinished one.
+        speed: Learn nothing and show one walk at this speed in m/s (walk only).
+        policy: Policy file for --speed; the latest learned or else the shipped one by default.
+    """
+
+    name: Positional[_Name]
+    preset: _Text = None
+    iterations: _Integer = None
+    trials: _Integer = None
+    seed: _Integer = None
+    out: _File = None
+    resume: bool = False
+    speed: _Number = None
+    policy: _File = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Plot:
+    """Draw the figures of results again.
+
+    Attributes:
+        name: The experiment.
+        folder: Result folder; the latest finished one by default.
+    """
+
+    name: Positional[_Name]
+    folder: _File = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """Hold the latest results against the paper's; exit code 1 if a claim fails.
+
+    Attributes:
+        names: The experiments; all by default.
+    """
+
+    names: Positional[_Names] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Video:
+    """Film a walking policy at several speeds, side by side.
+
+    Attributes:
+        policy: Policy file; the latest learned or else the shipped one by default.
+        speeds: Speeds in m/s.
+        out: The .mp4 file.
+        seed: Seed of the noise; 0 by default.
+    """
+
+    policy: _File = None
+    speeds: tuple[float, ...] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    out: Path = Path("results/walk.mp4")
+    seed: int = 0
+
+
+Command = (
+    Annotated[List, subcommand("list")]
+    | Annotated[Run, subcommand("run")]
+    | Annotated[Plot, subcommand("plot")]
+    | Annotated[Check, subcommand("check")]
+    | Annotated[Video, subcommand("video")]
+)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Do what the arguments ask for and return the exit code: 2 for a mistake, 130 for an interrupt."""
+    if not arguments or list(arguments) in (["-h"], ["--help"], ["help"]):
+        print(OVERVIEW, end="")
+        return 0
+    command = tyro.cli(
+        Command, args=list(arguments), prog="python -m experiments", config=(FlagCreatePairsOff,)
+    )  # type: ignore[arg-type]
+    try:
+        return _HANDLERS[type(command)](command)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _list(_: List) -> int:
+    width = max(map(len, registry.DESCRIPTIONS))
+    for name, description in registry.DESCRIPTIONS.items():
+        print(f"{name:{width}}  {description}")
+    return 0
+
+
+def _run(command: Run) -> int:
+    registry.check_name(command.name)
+    if command.speed is not None:
+        return _show(command, command.speed)
+    if command.policy is not None:
+        raise UserError("--policy goes with --speed")
+    import_mjx_quietly()
+    from rich.console import Console
+
+    from experiments import runner
+
+    asked = {"iterations": command.iterations, "trials": command.trials}
+    request = runner.Request(
+        name=command.name,
+        preset=command.preset,
+        seed=command.seed,
+        overrides={name: value for name, value in asked.items() if value is not None},
+        out=command.out,
+        resume=command.resume,
+    )
+    # A run that is told to end saves what it has, as one that is interrupted does.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    runner.run(request, console=Console(highlight=False, soft_wrap=True), say=_say)
+    return 0
+
+
+def _show(command: Run, speed: float) -> int:
+    if command.name != "walk":
+        raise UserError(f"--speed goes with walk, not with {command.name}")
+    learning = {"preset": command.preset, "iterations": command.iterations, "trials": command.trials}
+    for name, value in {**learning, "resume": command.resume or None}.items():
+        if value is not None:
+            raise UserError(f"--{name} does not go with --speed, which learns nothing")
+    import_mjx_quietly()
+    from experiments import walking_policy
+
+    walking_policy.show(speed, command.policy, out=command.out, seed=command.seed or 0, say=_say)
+    return 0
+
+
+def _plot(command: Plot) -> int:
+    registry.check_name(command.name)
+    import_mjx_quietly()
+    from experiments import runner
+
+    runner.plot(command.name, command.folder, say=_say)
+    return 0
+
+
+def _check(command: Check) -> int:
+    for name in command.names:
+        registry.check_name(name)
+    import_mjx_quietly()
+    from experiments import runner
+
+    return 0 if runner.check(command.names, say=_say) else 1
+
+
+def _video(command: Video) -> int:
+    import_mjx_quietly()
+    from experiments import walking_policy
+
+    walking_policy.film(command.speeds, command.policy, out=command.out, seed=command.seed, say=_say)
+    return 0
+
+
+_HANDLERS = {List: _list, Run: _run, Plot: _plot, Check: _check, Video: _video}

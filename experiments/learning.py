@@ -1,0 +1,197 @@
+"""Learn with progress to see and checkpoints to go on from."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from creps_jax.creps import Creps, CrepsState
+from creps_jax.policy import LinearGaussian
+from creps_jax.tasks.base import Task
+from creps_jax.train import train_trials
+from experiments.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
+from experiments.progress import Progress, Row
+
+_SECONDS_BETWEEN_CHECKPOINTS = 2.0
+
+Log = dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Session:
+    """Where a run keeps what it needs to go on, and whom it tells how it gets on.
+
+    Attributes:
+        folder: the result folder; None keeps nothing.
+        identity: what tells this run from others, see `save_checkpoint`.
+        console: where progress is shown; None shows nothing.
+    """
+
+    folder: Path | None = None
+    identity: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    console: Console | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """How long to learn, and with how many samples.
+
+    Attributes:
+        iterations: number of iterations, those of an interrupted run included.
+        samples: new samples of an iteration, of each trial.
+        first_samples: new samples of the first iteration.
+        repeats: rollouts of a sample.
+        timestep: physics time step in seconds, to count steps a second; None where there is none.
+    """
+
+    iterations: int
+    samples: int
+    first_samples: int | None = None
+    repeats: int = 1
+    timestep: float | None = None
+
+    def episodes(self, iteration: np.ndarray | int) -> Any:
+        """Count the rollouts of a trial up to and including an iteration, which counts from 1."""
+        first = self.samples if self.first_samples is None else self.first_samples
+        return self.repeats * (first + self.samples * (np.asarray(iteration) - 1))
+
+
+def trial_keys(key: jax.Array, trials: int) -> jax.Array:
+    """Return a key for each trial; a trial has the same one however many there are."""
+    return jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.arange(trials, dtype=jnp.uint32))
+
+
+def learn(
+    keys: jax.Array,
+    task: Task,
+    algorithm: Creps,
+    policy: LinearGaussian,
+    plan: Plan,
+    *,
+    session: Session,
+    name: str,
+    devices: Sequence[jax.Device] | None = None,
+) -> tuple[CrepsState, Log]:
+    """Run all trials at once, or the rest of them where the session's folder holds a checkpoint.
+
+    Args:
+        keys: (trials,) key of each trial.
+        task: what to learn.
+        algorithm: what learns it.
+        policy: the first policy of every trial.
+        plan: iterations and samples.
+        session: where to keep checkpoints and show progress.
+        name: names the checkpoint, `checkpoint-NAME.npz`, and heads the progress.
+        devices: devices that share the rollouts, by default all local ones.
+
+    Returns:
+        The last states (trials, ...), and the logs by name (trials, iterations, ...); `coef` among
+        them is the mean policy's after each iteration.
+
+    Raises:
+        KeyboardInterrupt: once the last whole iteration is saved.
+        UserError: if the checkpoint is unreadable, of another run, or cannot be written.
+    """
+    first = algorithm.init(policy)
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(keys), *leaf.shape)), first)
+    path = None if session.folder is None else session.folder / f"checkpoint-{name}.npz"
+    identity = {**session.identity, "part": name, "trials": len(keys)}
+    latest = Checkpoint(states, {})
+    if path is not None and path.exists():
+        latest = load_checkpoint(path, states, run=identity)
+    keeper = _Keeper(latest, lambda checkpoint: path and save_checkpoint(path, checkpoint, run=identity))
+    done = len(latest.log["mean_reward"]) if latest.log else 0
+    if done < plan.iterations:
+        with _Reporter(name, plan, done=done, console=session.console) as report, keeper:
+
+            def on_iteration(state: CrepsState, log: Any) -> None:
+                keeper.take(state, log)
+                report(log)
+
+            train_trials(
+                keys,
+                task,
+                algorithm,
+                latest.state,
+                iterations=plan.iterations - done,
+                samples=plan.samples,
+                first_samples=plan.first_samples,
+                on_iteration=on_iteration,
+                devices=devices,
+            )
+    latest = keeper.latest
+    # A run that is resumed with fewer iterations than it has keeps what it has.
+    return latest.state, {field: np.swapaxes(values, 0, 1) for field, values in latest.log.items()}
+
+
+class _Keeper:
+    """Save the latest iteration now and then, and on the way out, whatever the way."""
+
+    def __init__(self, latest: Checkpoint, save: Callable[[Checkpoint], Any]):
+        self.latest = latest
+        self._save = save
+        self._saved = latest
+        self._saved_at = time.monotonic()
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, *_: object) -> None:
+        if self._saved is not self.latest:
+            self._write()
+
+    def take(self, state: CrepsState, log: Any) -> None:
+        # One assignment: an interrupt finds the iteration either here whole or not at all.
+        row = {**named_leaves(log), "coef": np.asarray(state.policy.coef)}
+        self.latest = Checkpoint(state, append_log(self.latest.log, row))
+        if time.monotonic() - self._saved_at >= _SECONDS_BETWEEN_CHECKPOINTS:
+            self._write()
+
+    def _write(self) -> None:
+        self._save(self.latest)
+        self._saved, self._saved_at = self.latest, time.monotonic()
+
+
+class _Reporter:
+    """Turn the logs of iterations into rows of progress."""
+
+    def __init__(self, name: str, plan: Plan, *, done: int, console: Console | None):
+        self._plan, self._done = plan, done
+        self._progress = None
+        if console is not None:
+            self._progress = Progress(
+                f"learning {name}", plan.iterations, done=done, timestep=plan.timestep, console=console
+            )
+
+    def __enter__(self) -> Callable[[Any], None]:
+        if self._progress is not None:
+            self._progress.__enter__()
+        return self._report
+
+    def __exit__(self, *error: object) -> None:
+        if self._progress is not None:
+            self._progress.__exit__(*error)
+
+    def _report(self, log: Any) -> None:
+        self._done += 1
+        if self._progress is None:
+            return
+        trials = len(log.mean_reward)
+        episodes = trials * int(self._plan.episodes(self._done))
+        new = episodes - (trials * int(self._plan.episodes(self._done - 1)) if self._done > 1 else 0)
+        fell, seconds = getattr(log.outcome, "fell", None), getattr(log.outcome, "seconds", None)
+        row = Row(
+            iteration=self._done,
+            episodes=episodes,
+            mean_reward=float(np.mean(log.mean_reward)),
+            fall_share=None if fell is None else float(np.mean(fell)),
+            kl=float(np.mean(log.info.kl)),
+            simulated_seconds=None if seconds is None else float(np.mean(seconds)) * new,
+        )
+        self._progress.update(row)

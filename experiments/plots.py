@@ -1,0 +1,262 @@
+"""Draw figures in one style: learning curves, and what a policy does and reaches for each context."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
+
+COLOURS = ("#0b6e99", "#d1495b", "#edae49", "#3d7a4f", "#7a5195")
+PAPER_COLOUR = "#8a8a8a"
+FALL_COLOUR = "#d1495b"
+
+_STYLE: dict[Any, Any] = {
+    "figure.dpi": 110,
+    "savefig.dpi": 150,
+    "figure.constrained_layout.use": True,
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.8,
+    "legend.framealpha": 0.85,
+    "legend.edgecolor": "none",
+    "lines.linewidth": 1.8,
+    "axes.prop_cycle": cycler(color=COLOURS),
+}
+matplotlib.rcParams.update(_STYLE)
+
+
+def new_figure(
+    rows: int = 1, columns: int = 1, *, width: float = 6.4, height: float = 4.0, **settings: Any
+) -> tuple[Figure, np.ndarray]:
+    """Make a figure in the house style, and its axes as an array of shape (rows, columns).
+
+    pyplot knows nothing of it: no screen is needed, and nothing has to be closed.
+    """
+    figure = Figure(figsize=(width, height))
+    return figure, figure.subplots(rows, columns, squeeze=False, **settings)
+
+
+def plot_learning_curve(
+    axes: Axes, episodes: np.ndarray, rewards: np.ndarray, label: str, *, colour: str | None = None
+) -> None:
+    """Draw trials, their mean and, of three trials or more, its 95 % interval.
+
+    Args:
+        axes: where to.
+        episodes: (iterations,) rollouts so far.
+        rewards: (trials, iterations) mean rewards; NaN leaves a gap.
+        label: the name of the curve; the number of trials is added.
+        colour: by default the next one.
+    """
+    rewards = np.atleast_2d(np.asarray(rewards, float))
+    num_trials = len(rewards)
+    mean = _mean_of_finite(rewards)
+    (line,) = axes.plot(episodes, mean, color=colour, label=f"{label} (n = {num_trials})")
+    if num_trials > 1:
+        for trial in rewards:
+            axes.plot(episodes, trial, color=line.get_color(), linewidth=0.6, alpha=0.35)
+    if num_trials > 2:
+        low, high = confidence_interval(rewards)
+        axes.fill_between(episodes, low, high, color=line.get_color(), alpha=0.18, linewidth=0)
+
+
+def confidence_interval(samples: np.ndarray, *, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+    """Return the percentile bootstrap interval of the mean over the first axis, ignoring what is not finite.
+
+    Unlike Student's it stays among the samples: below zero, where a logarithmic scale has a place for it.
+    """
+    samples = np.asarray(samples, float)
+    rows = np.random.default_rng(0).integers(len(samples), size=(len(samples), 1000))
+    means = _mean_of_finite(samples[rows])
+    tail = 50 * (1 - level)
+    is_known = np.isfinite(means).all(axis=0)
+    bounds = np.percentile(np.where(is_known, means, 0.0), (tail, 100 - tail), axis=0)
+    low, high = np.where(is_known, bounds, np.nan)
+    return low, high
+
+
+def reward_scale(axes: Axes, rewards: Sequence[np.ndarray]) -> None:
+    """Scale the vertical axis as the paper does: the logarithm of what is missing to a reward of zero.
+
+    Rewards that reach above zero, or span less than a factor of ten, keep a linear axis.
+    """
+    values = np.concatenate([np.ravel(np.asarray(reward, float)) for reward in rewards])
+    values = values[np.isfinite(values)]
+    if not len(values) or values.max() > 0:
+        return
+    missing = -values[values < 0]
+    if not len(missing) or missing.max() < 10 * missing.min():
+        return
+    # Below a millionth of the worst reward a curve is as good as at zero.
+    threshold = max(missing.min(), 1e-6 * missing.max())
+    axes.set_yscale("symlog", linthresh=threshold, linscale=0.3)
+    decades = np.arange(math.floor(math.log10(threshold)), math.ceil(math.log10(missing.max())) + 1)
+    decades = decades[:: math.ceil(len(decades) / 7)]
+    axes.set_yticks([-(10.0**decade) for decade in decades])
+    axes.set_ylim(-missing.max() * 1.5, -threshold * 0.5)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
+def learning_curves(
+    panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
+    *,
+    references: Mapping[str, float] | None = None,
+) -> Figure:
+    """Draw learning curves of one or more algorithms, in panels that share their scales.
+
+    Args:
+        panels: by title, curves: by name, (episodes (iterations,), rewards (trials, iterations)).
+        references: horizontal lines by name, the paper's result for example.
+    """
+    width = 6.4 if len(panels) == 1 else 5.0 * len(panels)
+    figure, grid = new_figure(1, len(panels), width=width, sharex=True, sharey=True)
+    for axes, (title, curves) in zip(grid[0], panels.items(), strict=True):
+        for label, (episodes, rewards) in curves.items():
+            plot_learning_curve(axes, episodes, rewards, label)
+        for label, value in (references or {}).items():
+            axes.axhline(value, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label=label)
+        axes.set(xlabel="episodes", title=title)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axes.legend(loc="lower right")
+    grid[0, 0].set_ylabel("mean reward")
+    reward_scale(grid[0, 0], [rewards for curves in panels.values() for _, rewards in curves.values()])
+    return figure
+
+
+def parameters_against_context(
+    context: np.ndarray,
+    theta: np.ndarray,
+    *,
+    names: Sequence[str],
+    units: Sequence[str],
+    low: Sequence[float] | np.ndarray,
+    high: Sequence[float] | np.ndarray,
+    context_label: str,
+    title: str,
+) -> Figure:
+    """Draw each parameter of a policy against its context, in its own units, as small multiples.
+
+    Args:
+        context: (n,) values of the context.
+        theta: (trials, n, d) or (n, d) physical parameters.
+        names: the d parameters, with `units` and the bounds `low` and `high`.
+        units: an empty string is a number without a unit.
+        low: lower bounds, drawn as thin lines, as are the upper ones.
+        high: upper bounds.
+        context_label: name and unit of the context.
+        title: heading of the figure.
+    """
+    theta = np.asarray(theta, float)
+    theta = theta[None] if theta.ndim == 2 else theta
+    columns = min(5, len(names))
+    rows = math.ceil(len(names) / columns)
+    figure, grid = new_figure(rows, columns, width=2.6 * columns, height=2.1 * rows + 0.5, sharex=True)
+    for index, axes in enumerate(grid.flat):
+        if index >= len(names):
+            axes.set_visible(False)
+            continue
+        for bound in (low[index], high[index]):
+            axes.axhline(bound, color=PAPER_COLOUR, linewidth=0.8, linestyle=":")
+        for trial in theta:
+            axes.plot(context, trial[:, index], color=COLOURS[0], linewidth=0.8 if len(theta) > 1 else 1.8)
+        if len(theta) > 1:
+            axes.plot(context, theta[..., index].mean(axis=0), color=COLOURS[0])
+        unit = f" ({units[index]})" if units[index] else ""
+        axes.set_title(f"{names[index]}{unit}", fontsize=9)
+    # The last row that is there labels each column.
+    for column in range(columns):
+        last = max(row for row in range(rows) if row * columns + column < len(names))
+        grid[last, column].set_xlabel(context_label)
+        grid[last, column].tick_params(labelbottom=True)
+    figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
+    return figure
+
+
+def reached_against_asked(
+    asked: np.ndarray,
+    reached: np.ndarray,
+    fell: np.ndarray,
+    *,
+    title: str,
+    paper: np.ndarray | None = None,
+) -> Figure:
+    """Draw the speed reached against the speed asked for: each seed, the median, and the falls.
+
+    Args:
+        asked: (n,) asked speeds, m/s.
+        reached: (n, seeds) forward speeds, m/s.
+        fell: (n, seeds) whether the robot fell.
+        title: heading of the figure.
+        paper: (n,) lowest speeds that the paper's rewards allow for, m/s.
+    """
+    asked, reached, fell = np.asarray(asked, float), np.asarray(reached, float), np.asarray(fell, bool)
+    figure, axes = new_figure(width=5.4, height=4.6)
+    axes = axes[0, 0]
+    axes.plot(asked, asked, color="black", linewidth=1.0, linestyle="--", label="asked for")
+    if paper is not None:
+        axes.plot(asked, paper, color=PAPER_COLOUR, linewidth=1.2, label="paper, at least (from its rewards)")
+    spacing = np.diff(asked).min() if len(asked) > 1 else 0.1
+    # Seeds stand side by side, or they would hide each other.
+    offset = np.linspace(-0.25, 0.25, reached.shape[1]) * spacing if reached.shape[1] > 1 else np.zeros(1)
+    position = asked[:, None] + offset
+    axes.scatter(
+        position[~fell], reached[~fell], s=12, color=COLOURS[0], alpha=0.55, linewidth=0, label="a walk"
+    )
+    if fell.any():
+        axes.scatter(
+            position[fell], reached[fell], s=26, color=FALL_COLOUR, marker="x", label=f"a fall ({fell.sum()})"
+        )
+    median = np.array(
+        [np.median(row[np.isfinite(row)]) if np.isfinite(row).any() else np.nan for row in reached]
+    )
+    axes.plot(asked, median, color=COLOURS[0], label=f"median of {reached.shape[1]} seeds")
+    axes.set(xlabel="asked speed (m/s)", ylabel="reached speed (m/s)", title=title)
+    axes.legend(loc="upper left")
+    return figure
+
+
+def plot_policy(
+    axes: Axes,
+    context: np.ndarray,
+    means: np.ndarray,
+    wanted: np.ndarray,
+    *,
+    title: str,
+    labels: tuple[str, str],
+) -> None:
+    """Draw the mean of learned policies of one parameter over the context, beside the best answer.
+
+    Args:
+        axes: where to.
+        context: (n,) contexts.
+        means: (trials, n) means of the policies.
+        wanted: (n,) the best parameter.
+        title: heading of the axes.
+        labels: names of the context and of the parameter.
+    """
+    axes.plot(context, wanted, color="black", linestyle="--", linewidth=1.2, label="optimum")
+    for trial, mean in enumerate(np.atleast_2d(means)):
+        label = f"learned (n = {len(means)})" if trial == 0 else None
+        axes.plot(context, mean, color=COLOURS[0], linewidth=1.2, alpha=0.8, label=label)
+    axes.set(xlabel=labels[0], ylabel=labels[1], title=title)
+    axes.margins(y=0.2)
+    axes.legend(loc="upper center", ncols=2)
+
+
+def _mean_of_finite(samples: np.ndarray) -> np.ndarray:
+    is_finite = np.isfinite(samples)
+    total = np.where(is_finite, samples, 0.0).sum(axis=0)
+    return np.where(is_finite.any(axis=0), total / np.maximum(is_finite.sum(axis=0), 1), np.nan)

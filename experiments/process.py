@@ -1,0 +1,53 @@
+"""Set up the process before jax and MuJoCo start: devices, threads, the compilation cache, quiet imports."""
+
+import contextlib
+import io
+import os
+from pathlib import Path
+
+# One thread a device, and the small matrix products of the physics without the set-up costs of a library
+# for large ones.
+XLA_FLAGS = ("--xla_cpu_multi_thread_eigen=false", "--xla_cpu_experimental_ynn_fusion_type=")
+
+
+def usable_cores() -> int:
+    """Count the processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def cache_folder() -> Path:
+    """Return the user's cache folder for compiled programs; it may not exist yet."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "creps_jax" / "jax"
+
+
+def prepare() -> None:
+    """Set what jax reads from the environment when it starts; what the user has set stays.
+
+    One CPU device a core, each with one thread, steps a batch about twice as fast as one device
+    with many threads. The compilation cache saves most of the compiling in the next process.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    ours = [flag for flag in XLA_FLAGS if flag.partition("=")[0] not in flags]
+    os.environ["XLA_FLAGS"] = " ".join([*flags.split(), *ours])
+    if "xla_force_host_platform_device_count" not in flags:
+        os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(usable_cores()))
+    # Nor may the small factorisations of an update spin threads of their own against the devices': on
+    # busy cores that made one a hundred times slower.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        # Without a writable home there is no cache, and nothing else changes.
+        with contextlib.suppress(OSError, RuntimeError):
+            folder = cache_folder()
+            folder.mkdir(parents=True, exist_ok=True)
+            os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
+
+
+def import_mjx_quietly() -> None:
+    """Import MJX while its lines about a missing Warp are kept from stdout."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(ImportError):
+        from mujoco import mjx  # noqa: F401

@@ -1,0 +1,87 @@
+"""List the experiments by name, and load one when it is asked for."""
+
+import difflib
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol, cast
+
+import numpy as np
+
+from experiments.errors import UserError
+
+DESCRIPTIONS = {
+    "walk": "a NAO learns to walk at the speed you ask for (the main job)",
+    "fig05_sinus": "learn the sine of the context, with linear and with RBF features (Fig. 5)",
+}
+"""What each experiment shows; its module has the same name."""
+
+
+class Claim(NamedTuple):
+    """Something that a figure or table of the paper says, and what we ask of ours.
+
+    Attributes:
+        metric: what is measured.
+        paper: the paper's value; None where it prints none.
+        measure: from an experiment's arrays to our value.
+        low: the least that ours may be.
+        high: the most that ours may be.
+    """
+
+    metric: str
+    paper: float | None
+    measure: Callable[[Mapping[str, np.ndarray]], float]
+    low: float = -np.inf
+    high: float = np.inf
+
+
+class Experiment(Protocol):
+    """What a module of an experiment has; it may also have `finish(settings, arrays, folder, say)`."""
+
+    Settings: type[Any]
+    SETTINGS: Mapping[str, Any]
+    CLAIMS: tuple[Claim, ...]
+
+    def run(self, settings: Any, key: Any, session: Any) -> dict[str, np.ndarray]:
+        """Compute the arrays of the experiment."""
+        ...
+
+    def plot(self, arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        """Draw its figures, by file name without ending."""
+        ...
+
+
+def check_name(name: str) -> None:
+    """Refuse a name that no experiment has.
+
+    Raises:
+        UserError: with the nearest name, and all of them.
+    """
+    if name not in DESCRIPTIONS:
+        raise UserError(f"unknown experiment {name!r}{_suggest(name, DESCRIPTIONS)}")
+
+
+def load(name: str) -> Experiment:
+    """Import the module of an experiment.
+
+    Raises:
+        UserError: if there is none of that name.
+    """
+    check_name(name)
+    return cast(Experiment, importlib.import_module(f"experiments.{name}"))
+
+
+def preset_settings(experiment: Experiment, preset: str) -> Any:
+    """Return the settings of a preset.
+
+    Raises:
+        UserError: if the experiment has none of that name.
+    """
+    if preset not in experiment.SETTINGS:
+        raise UserError(f"unknown preset {preset!r}{_suggest(preset, experiment.SETTINGS)}")
+    return experiment.SETTINGS[preset]
+
+
+def _suggest(name: str, known: Mapping[str, object]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    hint = f", did you mean {near[0]!r}?" if near else ","
+    return f"{hint} choose from: {', '.join(known)}"

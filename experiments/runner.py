@@ -1,0 +1,224 @@
+"""Run an experiment into a result folder, go on with one, draw its figures again, check its claims."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from experiments import registry, results
+from experiments.errors import UserError
+from experiments.learning import Session
+from experiments.tables import to_markdown
+
+Say = Callable[[str], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Request:
+    """What to run; None leaves a choice to the preset or to the run that is resumed.
+
+    Attributes:
+        name: the experiment.
+        preset: a name among its presets.
+        seed: seed of the random key.
+        overrides: settings by name, in place of the preset's.
+        out: the result folder.
+        resume: whether to go on with the run in `out`, or with the latest one that has not finished.
+    """
+
+    name: str
+    preset: str | None = None
+    seed: int | None = None
+    overrides: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    out: Path | None = None
+    resume: bool = False
+
+
+def run(request: Request, *, console: Console | None, say: Say) -> Path:
+    """Run an experiment and fill its result folder.
+
+    Args:
+        request: what to run.
+        console: where progress is shown; None shows nothing.
+        say: told one line at a time what was done.
+
+    Returns:
+        The result folder.
+
+    Raises:
+        UserError: for a mistake in the request, or a folder that cannot be used.
+        KeyboardInterrupt: once what is needed to go on is saved, and `say` was told how to.
+    """
+    registry.check_name(request.name)
+    experiment = registry.load(request.name)
+    settings, folder, manifest = (_resumed if request.resume else _started)(experiment, request)
+    say(f"results go to {folder}")
+    before, begin = manifest["seconds"], time.monotonic()
+
+    def update(status: str) -> None:
+        manifest.update(status=status, seconds=round(before + time.monotonic() - begin, 1))
+        results.save_json(folder / results.MANIFEST, manifest)
+
+    manifest["devices"] = [str(device) for device in jax.local_devices()]
+    update("running")
+    try:
+        session = Session(folder, _identity(request.name, settings, manifest["seed"]), console)
+        arrays = experiment.run(settings, jax.random.key(manifest["seed"]), session)
+        results.save_arrays(folder / results.ARRAYS, arrays)
+        _draw(experiment, arrays, folder, say)
+        if hasattr(experiment, "finish"):
+            experiment.finish(settings, arrays, folder, say)  # type: ignore[attr-defined]
+    except KeyboardInterrupt:
+        update("interrupted")
+        say(f"stopped; to go on: python -m experiments run {request.name} --resume --out {folder}")
+        raise
+    except Exception:
+        update("failed")
+        raise
+    update("finished")
+    _save_claims(experiment, arrays, folder)
+    say(f"finished in {manifest['seconds']:.0f} s: {folder}")
+    return folder
+
+
+def plot(name: str, folder: Path | None, *, say: Say) -> Path:
+    """Draw the figures of a result folder again, by default of the latest one, and return the folder.
+
+    Raises:
+        UserError: if there are no results to draw.
+    """
+    experiment = registry.load(name)
+    folder = folder or _latest_finished(name)
+    _draw(experiment, results.load_arrays(folder / results.ARRAYS), folder, say)
+    return folder
+
+
+def check(names: tuple[str, ...], *, say: Say) -> bool:
+    """Hold the claims of experiments against their latest results, and return whether all hold.
+
+    An experiment without results makes no claim; it is named.
+    """
+    all_hold = True
+    for name in names or tuple(registry.DESCRIPTIONS):
+        registry.check_name(name)
+        folder = results.latest_folder(name, status="finished")
+        if folder is None:
+            say(f"{name}: no results yet (python -m experiments run {name})\n")
+            continue
+        rows = claim_rows(registry.load(name), results.load_arrays(folder / results.ARRAYS))
+        all_hold &= all(row["holds"] for row in rows)
+        say(f"{name}: {folder}\n\n{_claims_table(rows)}")
+    return all_hold
+
+
+def claim_rows(experiment: registry.Experiment, arrays: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+    """Measure each claim of an experiment on its arrays."""
+    rows = []
+    for claim in experiment.CLAIMS:
+        ours = float(claim.measure(arrays))
+        rows.append({**claim._asdict(), "ours": ours, "holds": bool(claim.low <= ours <= claim.high)})
+        del rows[-1]["measure"]
+    return rows
+
+
+def _started(experiment: registry.Experiment, request: Request) -> tuple[Any, Path, dict[str, Any]]:
+    """Return settings, an empty result folder and a manifest for a run from the beginning."""
+    preset = request.preset or next(iter(experiment.SETTINGS))
+    settings = _override(registry.preset_settings(experiment, preset), request)
+    folder = request.out
+    if folder is None:
+        folder = results.new_folder(results.default_root() / request.name, f"{results.stamp()}-{preset}")
+    elif (folder / results.MANIFEST).exists():
+        raise UserError(
+            f"{folder} holds a run already: add --resume to go on with it, or name another folder"
+        )
+    elif folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder} is a file, expected a folder")
+    return settings, folder, results.make_manifest(request.name, preset, settings, request.seed or 0)
+
+
+def _resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Path, dict[str, Any]]:
+    """Return settings, folder and manifest of a run to go on with."""
+    folder = request.out
+    if folder is None:
+        found = [
+            results.latest_folder(request.name, status=status)
+            for status in ("running", "interrupted", "failed")
+        ]
+        folder = max((path for path in found if path is not None), default=None, key=lambda path: path.name)
+        if folder is None:
+            raise UserError(f"there is no unfinished run of {request.name} in {results.default_root()}")
+    manifest = results.load_manifest(folder)
+    for field, asked in (("experiment", request.name), ("preset", request.preset), ("seed", request.seed)):
+        if asked is not None and manifest.get(field) != asked:
+            raise UserError(
+                f"{folder} has {field} {manifest.get(field)!r}, not {asked!r}; leave it out to resume"
+            )
+    try:
+        settings = experiment.Settings(**_as_tuples(manifest["settings"]))
+    except TypeError as error:
+        raise UserError(f"{folder} was made with other settings than this version has: {error}") from error
+    settings = _override(settings, request)
+    manifest["settings"] = dataclasses.asdict(settings)
+    return settings, folder, manifest
+
+
+def _override(settings: Any, request: Request) -> Any:
+    known = {field.name for field in dataclasses.fields(settings)}
+    for name, value in request.overrides.items():
+        if name not in known:
+            raise UserError(f"{request.name} has no setting {name!r}")
+        if isinstance(value, int) and value < 1:
+            raise UserError(f"{name} must be at least 1, got {value}")
+    return dataclasses.replace(settings, **request.overrides)
+
+
+def _identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
+    """Return what has to agree for a checkpoint to belong to a run: all but how long it goes on."""
+    same = {key: value for key, value in dataclasses.asdict(settings).items() if key != "iterations"}
+    return {"experiment": name, "seed": seed, "settings": same}
+
+
+def _draw(experiment: registry.Experiment, arrays: Mapping[str, np.ndarray], folder: Path, say: Say) -> None:
+    for name, figure in experiment.plot(arrays).items():
+        results.save_figure(folder / f"{name}.png", figure)
+        say(f"figure: {folder / name}.png")
+
+
+def _save_claims(experiment: registry.Experiment, arrays: Mapping[str, np.ndarray], folder: Path) -> None:
+    if experiment.CLAIMS:
+        results.save_text(folder / "claims.md", _claims_table(claim_rows(experiment, arrays)))
+
+
+def _claims_table(rows: list[dict[str, Any]]) -> str:
+    def number(value: float | None) -> str:
+        return "-" if value is None or not np.isfinite(value) else f"{value:.4g}"
+
+    columns = {
+        "metric": [row["metric"] for row in rows],
+        "paper": [number(row["paper"]) for row in rows],
+        "ours": [number(row["ours"]) for row in rows],
+        "at least": [number(row["low"]) for row in rows],
+        "at most": [number(row["high"]) for row in rows],
+        "holds": ["yes" if row["holds"] else "NO" for row in rows],
+    }
+    return to_markdown(columns)
+
+
+def _latest_finished(name: str) -> Path:
+    folder = results.latest_folder(name, status="finished")
+    if folder is None:
+        raise UserError(f"there are no results of {name} in {results.default_root()}; run it first")
+    return folder
+
+
+def _as_tuples(value: Any) -> Any:
+    """Turn the lists that JSON made of tuples back."""
+    if isinstance(value, dict):
+        return {name: _as_tuples(entry) for name, entry in value.items()}
+    return tuple(_as_tuples(entry) for entry in value) if isinstance(value, list) else value

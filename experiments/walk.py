@@ -1,0 +1,292 @@
+"""Teach a NAO to walk at the speed it is asked for (Abdolmaleki et al. 2016, 4.3, Fig. 11, Table 2)."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from creps_jax.contexts import gaussian_contexts, uniform_contexts
+from creps_jax.creps import Creps, creps
+from creps_jax.features import quadratic_features
+from creps_jax.motion.walking.params import NAO_BOUNDS, PAPER_BOUNDS, PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
+from creps_jax.policy import LinearGaussian
+from creps_jax.tasks import Task, average_repeats, sigmoid_constrained
+from creps_jax.tasks.nao_walk import WalkNoise, nao_walk
+from creps_jax.train import evaluate
+from experiments import plots, results, tables
+from experiments.errors import UserError
+from experiments.learning import Plan, Session, learn, trial_keys
+from experiments.policy_file import Features, SavedPolicy, save_policy
+from experiments.registry import Claim
+from experiments.walking_policy import POLICY, START_UP, record, save_film
+
+BOUNDS = {"nao": NAO_BOUNDS, "paper": PAPER_BOUNDS}
+SAMPLERS = {"gaussian": partial(gaussian_contexts, clip=True), "uniform": uniform_contexts}
+FILMED_SPEEDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+TIMESTEP = 0.005
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of the experiment; the defaults are the paper's protocol.
+
+    Attributes:
+        iterations: iterations of learning.
+        trials: trials, all learned at once.
+        samples: new samples of an iteration, of each trial.
+        first_samples: new samples of the first iteration.
+        repeats: rollouts of a sample, averaged.
+        archive_size: L, samples kept.
+        kl_bound: epsilon, nats.
+        features: kind, number and width of the policy's features.
+        bounds: which box the parameters are kept in, a name in BOUNDS.
+        start_mean: mean of the first policy before squashing; 0 is the middle of the box.
+        start_std: its standard deviation before squashing.
+        low: lowest speed, m/s.
+        high: highest speed, m/s.
+        duration: length of an episode, s.
+        heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
+        sampler: how contexts are drawn in learning, a name in SAMPLERS.
+        learning_noise: how many times larger the noise is in learning than in the evaluation: a policy that has learned to
+            stay up in more of it falls less.
+        eval_seeds: fresh episodes at each speed of the table.
+    """
+
+    iterations: int = 300
+    trials: int = 1
+    samples: int = 30
+    first_samples: int = 100
+    repeats: int = 3
+    archive_size: int = 600
+    kl_bound: float = 0.5
+    features: Features = Features("rbf", 5)
+    bounds: str = "nao"
+    start_mean: float = 0.0
+    start_std: float = 1.0
+    low: float = 0.1
+    high: float = 0.6
+    duration: float = 8.0
+    heading_gain: float = 0.0
+    sampler: str = "gaussian"
+    learning_noise: float = 1.0
+    eval_seeds: int = 10
+
+    def __post_init__(self) -> None:
+        # Settings that come back from a manifest are plain.
+        if isinstance(self.features, Mapping):
+            object.__setattr__(self, "features", Features(**self.features))
+        if self.bounds not in BOUNDS:
+            raise UserError(f"bounds must be one of {', '.join(BOUNDS)}, got {self.bounds!r}")
+
+
+_OURS = Settings(archive_size=300, heading_gain=0.3, sampler="uniform", learning_noise=1.5, start_mean=-0.3)
+SETTINGS = {
+    "quick": dataclasses.replace(_OURS, iterations=50),
+    "paper": Settings(trials=5, bounds="paper"),
+    "best": dataclasses.replace(_OURS, iterations=140, samples=40, archive_size=400, eval_seeds=50),
+}
+
+
+def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
+    """Learn, then evaluate the mean policy of each trial at the paper's speeds with fresh seeds.
+
+    Returns:
+        Arrays of the learning (trials, iterations), the policies, their parameters over the speeds
+        (trials, n, d) and the evaluation (trials, n, seeds).
+    """
+    algorithm, start = make_algorithm(settings), first_policy(settings)
+    plan = Plan(
+        settings.iterations,
+        settings.samples,
+        settings.first_samples,
+        repeats=settings.repeats,
+        timestep=TIMESTEP,
+    )
+    learn_key, evaluate_key = jax.random.split(key)
+    states, log = learn(
+        trial_keys(learn_key, settings.trials),
+        average_repeats(make_task(settings, noise=settings.learning_noise), settings.repeats),
+        algorithm,
+        start,
+        plan,
+        session=session,
+        name="walk",
+    )
+    speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
+    free = np.asarray(jax.vmap(algorithm.mean, (0, None))(states.policy, speeds[:, None]))
+    outcome = evaluate_trials(evaluate_key, make_task(settings), speeds, free, repeats=settings.eval_seeds)
+    fine = np.linspace(settings.low, settings.high, 51, dtype=np.float32)
+    policies = [
+        saved_policy(settings, LinearGaussian(*pair))
+        for pair in zip(*map(np.asarray, states.policy), strict=True)
+    ]
+    num_done = log["mean_reward"].shape[1]
+    return {
+        "episodes": plan.episodes(np.arange(1, num_done + 1)),
+        "coef": np.asarray(states.policy.coef),
+        "cov_chol": np.asarray(states.policy.cov_chol),
+        "fine_speeds": fine,
+        "fine_theta": np.stack([[policy.theta(float(speed)) for speed in fine] for policy in policies]),
+        "speeds": speeds,
+        "reward": outcome.reward,
+        "speed": outcome.speed,
+        "fell": outcome.fell,
+        **{f"bound_{side}": np.array(BOUNDS[settings.bounds][i]) for i, side in enumerate(("low", "high"))},
+        **{f"log.{name}": values for name, values in log.items()},
+    }
+
+
+def make_task(settings: Settings, *, noise: float = 1.0) -> Task:
+    """Make the walking task, with parameters that are squashed into their bounds.
+
+    Args:
+        settings: settings of the experiment.
+        noise: how many times the usual noise.
+    """
+    for name, value, known in (("bounds", settings.bounds, BOUNDS), ("sampler", settings.sampler, SAMPLERS)):
+        if value not in known:
+            raise UserError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    task = nao_walk(
+        settings.low,
+        settings.high,
+        sample_context=SAMPLERS[settings.sampler](settings.low, settings.high),
+        duration=settings.duration,
+        start_up=START_UP,
+        noise=WalkNoise(*(noise * size for size in WalkNoise())),
+        heading_gain=settings.heading_gain,
+    )
+    return sigmoid_constrained(task, *BOUNDS[settings.bounds])
+
+
+def make_algorithm(settings: Settings) -> Creps:
+    """Set up contextual REPS; the RBFs serve as policy and as baseline features."""
+    features = settings.features.make(settings.low, settings.high)
+    baseline = quadratic_features(1) if settings.features.kind == "linear" else features
+    return creps(features, baseline, kl_bound=settings.kl_bound, archive_size=settings.archive_size)
+
+
+def first_policy(settings: Settings) -> LinearGaussian:
+    """Return the policy to begin with: the same for every speed."""
+    num_features = settings.features.make(settings.low, settings.high).size
+    coef = jnp.full((num_features, len(PARAM_NAMES)), settings.start_mean)
+    if settings.features.kind == "linear":
+        coef = coef.at[1:].set(0.0)
+    return LinearGaussian(coef, settings.start_std * jnp.eye(len(PARAM_NAMES)))
+
+
+def evaluate_trials(
+    key: jax.Array, task: Task, contexts: np.ndarray, thetas: np.ndarray, *, repeats: int
+) -> Any:
+    """Roll out the parameters (trials, n, d) of each trial; outcome with axes (trials, n, repeats)."""
+    trials, num, _ = thetas.shape
+    rows = jnp.tile(jnp.asarray(contexts)[:, None], (trials, 1))
+    outcome = evaluate(key, task, rows, jnp.asarray(thetas).reshape(trials * num, -1), repeats=repeats)
+    return jax.tree.map(lambda leaf: np.asarray(leaf).reshape(trials, num, *leaf.shape[1:]), outcome)
+
+
+def saved_policy(settings: Settings, policy: LinearGaussian) -> SavedPolicy:
+    """Put a policy together with all that is needed to use it."""
+    low, high = BOUNDS[settings.bounds]
+    return SavedPolicy(
+        coef=np.asarray(policy.coef),
+        cov_chol=np.asarray(policy.cov_chol),
+        features=settings.features,
+        context_name="speed",
+        context_unit="m/s",
+        context_low=settings.low,
+        context_high=settings.high,
+        param_names=PARAM_NAMES,
+        param_units=PARAM_UNITS,
+        param_low=low,
+        param_high=high,
+        constraint="sigmoid",
+        task={"name": "walk", "heading_gain": settings.heading_gain},
+    )
+
+
+def chosen_trial(arrays: Mapping[str, np.ndarray]) -> int:
+    """Choose the trial whose policy is kept: by its last iterations of learning, not by its evaluation."""
+    return int(np.argmax(arrays["log.mean_reward"][:, -10:].mean(axis=1)))
+
+
+def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+    """Draw the learning curve, each parameter against speed, and reached against asked speed."""
+    trial = chosen_trial(arrays)
+    speeds = arrays["speeds"].astype(float)
+    lowest = np.asarray(tables.PAPER_SPEEDS) - np.sqrt(-np.asarray(tables.PAPER_RBF) / 10)
+    return {
+        "learning_curve": plots.learning_curves(
+            {"Learning to walk": {"new samples": (arrays["episodes"], arrays["log.mean_reward"])}}
+        ),
+        "parameters": plots.parameters_against_context(
+            arrays["fine_speeds"],
+            arrays["fine_theta"],
+            names=[
+                f"{name.replace('_', ' ')} {symbol}"
+                for name, symbol in zip(PARAM_NAMES, _symbols(), strict=True)
+            ],
+            units=PARAM_UNITS,
+            low=arrays["bound_low"],
+            high=arrays["bound_high"],
+            context_label="asked speed (m/s)",
+            title="What the robot changes to walk faster",
+        ),
+        "speed": plots.reached_against_asked(
+            speeds,
+            arrays["speed"][trial, ..., 0],
+            arrays["fell"][trial],
+            title="Reached against asked speed",
+            paper=lowest,
+        ),
+    }
+
+
+def finish(
+    settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable[[str], None]
+) -> None:
+    """Write policy, table and video of the chosen trial."""
+    trial = chosen_trial(arrays)
+    policy = saved_policy(settings, LinearGaussian(arrays["coef"][trial], arrays["cov_chol"][trial]))
+    save_policy(folder / POLICY, policy)
+    say(f"policy: {folder / POLICY}")
+    columns = tables.speed_table(
+        arrays["speeds"], arrays["reward"][trial], arrays["speed"][trial], arrays["fell"][trial]
+    )
+    results.save_text(folder / "table.csv", tables.to_csv(columns))
+    results.save_text(folder / "table.md", tables.to_markdown(columns))
+    say(f"\n{tables.to_markdown(columns)}")
+    speeds = [speed for speed in FILMED_SPEEDS if settings.low <= speed <= settings.high]
+    save_film(record(policy, speeds, seed=0, duration=settings.duration), folder / "walk.mp4", say)
+
+
+def _symbols() -> list[str]:
+    """Write the paper's symbols for matplotlib."""
+    greek = {"gamma": r"\gamma", "phi": r"\phi", "sigma": r"\sigma"}
+    symbols = []
+    for label in PARAM_LABELS:
+        head, _, tail = label.partition("_")
+        head = greek.get(head, head[0] + (f"_{{{head[1:]}}}" if len(head) > 1 else ""))
+        symbols.append(f"${head}_{{{tail}}}$" if tail else f"${head}$")
+    return symbols
+
+
+def _mean_reward(arrays: Mapping[str, np.ndarray]) -> float:
+    return float(arrays["reward"][chosen_trial(arrays)].mean())
+
+
+CLAIMS = (
+    Claim("mean reward over the 11 speeds", float(np.mean(tables.PAPER_RBF)), _mean_reward, low=-0.343),
+    Claim("share of falls", 0.0, lambda arrays: float(arrays["fell"][chosen_trial(arrays)].mean()), high=0.0),
+    Claim(
+        "speed reached when asked for 0.6 m/s",
+        0.3,
+        lambda arrays: float(arrays["speed"][chosen_trial(arrays), -1, :, 0].mean()),
+        low=0.5,
+    ),
+)

@@ -1,0 +1,118 @@
+"""Use a walking policy: record its walks, show one of them, film several side by side."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from creps_jax.motion.walking.params import PARAM_NAMES
+from creps_jax.tasks.nao_walk import CONTROL_PERIOD, record_walk
+from experiments import results
+from experiments.errors import UserError
+from experiments.policy_file import SavedPolicy, load_policy, policies_folder
+from experiments.video import Clip, VideoError, write_video
+
+POLICY = "policy.npz"
+START_UP = 2.0
+
+
+def show(speed: float, path: Path | None, *, out: Path | None, seed: int, say: Callable[[str], None]) -> None:
+    """Show one walk: its parameters, what it reaches, and a video.
+
+    Args:
+        speed: asked speed, m/s.
+        path: policy file; None is the latest learned one, or else the shipped one.
+        out: folder of the video, by default `results/walk`.
+        seed: seed of the noise.
+        say: told one line at a time.
+
+    Raises:
+        UserError: if there is no such policy, it is unreadable, or the speed is outside its range.
+    """
+    path = path or default_policy()
+    policy = load_walking_policy(path)
+    theta = policy.theta(speed)
+    say(f"policy: {path}")
+    for name, unit, value in zip(policy.param_names, policy.param_units, theta, strict=True):
+        say(f"  {name.replace('_', ' '):16}{value:8.4f} {unit}".rstrip())
+    video = (out or results.default_root() / "walk") / f"walk-{speed:.2f}.mp4"
+    clips = record(policy, (speed,), seed=seed)
+    say(clips[0].caption)
+    save_film(clips, video, say)
+
+
+def film(
+    speeds: Sequence[float], path: Path | None, *, out: Path, seed: int, say: Callable[[str], None]
+) -> None:
+    """Film a policy at several speeds, side by side.
+
+    Raises:
+        UserError: if the policy is unreadable, or a speed is outside its range.
+    """
+    clips = record(load_walking_policy(path or default_policy()), speeds, seed=seed)
+    for clip in clips:
+        say(clip.caption)
+    save_film(clips, out, say)
+
+
+def record(policy: SavedPolicy, speeds: Sequence[float], *, seed: int, duration: float = 8.0) -> list[Clip]:
+    """Record a walk at each speed, captioned with asked and reached speed.
+
+    Raises:
+        ValueError: if there is no speed, or one is outside the range that was learned.
+    """
+    if not speeds:
+        raise UserError("name at least one speed")
+    thetas = jnp.stack([jnp.asarray(policy.theta(speed)) for speed in speeds])
+    keys = jax.random.split(jax.random.key(seed), len(speeds))
+    gain = float(policy.task.get("heading_gain", 0.0))
+    walks = jax.jit(
+        jax.vmap(lambda key, theta: record_walk(key, theta, duration=duration, heading_gain=gain))
+    )(keys, thetas)
+    qpos, fallen = np.asarray(walks.qpos), np.asarray(walks.has_fallen)
+    clips = []
+    for index, speed in enumerate(speeds):
+        start = round(START_UP / CONTROL_PERIOD) - 1
+        reached = (qpos[index, -1, 0] - qpos[index, start, 0]) / (duration - START_UP)
+        verdict = "fell" if fallen[index, -1] else f"reached {reached:.2f} m/s"
+        clips.append(Clip(f"asked {speed:.2f} m/s, {verdict}", qpos[index], CONTROL_PERIOD))
+    return clips
+
+
+def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None]) -> None:
+    """Write a video, or say why there is none: it is the one part of a result that a machine may lack."""
+    try:
+        middle = len(clips[0].qpos) * clips[0].period / 2
+        write_video(path, results.ROOT / "models" / "nao" / "nao.xml", clips, still_at=middle)
+        say(f"video: {path}")
+    except VideoError as error:
+        say(str(error))
+
+
+def default_policy() -> Path:
+    """Return the policy of the latest finished run, or else the one that comes with the project.
+
+    Raises:
+        UserError: if there is neither.
+    """
+    folder = results.latest_folder("walk", status="finished")
+    if folder is not None and (folder / POLICY).exists():
+        return folder / POLICY
+    shipped = sorted(policies_folder().glob("*.npz"))
+    if not shipped:
+        raise UserError("no policy has been learned yet: python -m experiments run walk --preset quick")
+    return shipped[-1]
+
+
+def load_walking_policy(path: Path) -> SavedPolicy:
+    """Read a policy file and see that it is one of walking.
+
+    Raises:
+        UserError: if it is not, or is unreadable.
+    """
+    policy = load_policy(path)
+    if policy.param_names != PARAM_NAMES:
+        raise UserError(f"{path} is no walking policy: its parameters are {', '.join(policy.param_names)}")
+    return policy

@@ -1,0 +1,91 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from experiments import process
+
+ROOT = Path(__file__).parents[2]
+
+
+def prepared(tmp_path, **environment):
+    """Prepare a process with the given environment and return what it then has."""
+    code = (
+        "import json, os; from experiments.process import prepare; prepare(); prepare();"
+        "print(json.dumps(dict(os.environ)))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env={"HOME": str(tmp_path), "PATH": "", **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return json.loads(done.stdout)
+
+
+def test_a_device_for_each_core_one_thread_each_and_a_cache(tmp_path):
+    found = prepared(tmp_path)
+    assert found["JAX_NUM_CPU_DEVICES"] == str(process.usable_cores())
+    assert found["XLA_FLAGS"].split() == list(process.XLA_FLAGS)
+    assert Path(found["JAX_COMPILATION_CACHE_DIR"]) == tmp_path / ".cache" / "creps_jax" / "jax"
+    assert Path(found["JAX_COMPILATION_CACHE_DIR"]).is_dir()
+
+
+def test_what_the_user_has_set_stays(tmp_path):
+    wishes = {
+        "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=true --xla_force_host_platform_device_count=3",
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "mine"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "7",
+    }
+    found = prepared(tmp_path, **wishes)
+    assert set(found["XLA_FLAGS"].split()) >= set(wishes.pop("XLA_FLAGS").split())
+    assert "--xla_cpu_multi_thread_eigen=false" not in found["XLA_FLAGS"]
+    assert {name: found[name] for name in wishes} == wishes
+    assert "JAX_NUM_CPU_DEVICES" not in found
+    assert prepared(tmp_path, XLA_FLAGS="--foo=1")["XLA_FLAGS"].split() == ["--foo=1", *process.XLA_FLAGS]
+    assert prepared(tmp_path, JAX_NUM_CPU_DEVICES="1")["JAX_NUM_CPU_DEVICES"] == "1"
+
+
+def test_a_home_that_cannot_be_written_costs_only_the_cache(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert "JAX_COMPILATION_CACHE_DIR" not in prepared(tmp_path, HOME=str(tmp_path / "file"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "out", "error"),
+    [
+        ([], 0, "python -m experiments run walk", ""),
+        (["--help"], 0, "python -m experiments check", ""),
+        (["list"], 0, "fig05_sinus", ""),
+        (["run", "wlak"], 2, "", "error: unknown experiment 'wlak', did you mean 'walk'?"),
+        (["plot", "wlak"], 2, "", "error: unknown experiment"),
+        (["check", "wlak"], 2, "", "error: unknown experiment"),
+        (["run", "fig05_sinus", "--speed", "0.3"], 2, "", "error: --speed goes with walk"),
+        (
+            ["run", "walk", "--speed", "0.3", "--trials", "2"],
+            2,
+            "",
+            "error: --trials does not go with --speed",
+        ),
+        (["run", "walk", "--policy", "x.npz"], 2, "", "error: --policy goes with --speed"),
+    ],
+)
+def test_help_and_mistakes_are_answered_without_starting_jax(tmp_path, arguments, code, out, error):
+    program = (
+        "import sys; from experiments.cli import main; code = main(sys.argv[1:]);"
+        "heavy = {'jax', 'mujoco', 'matplotlib'} & set(sys.modules); assert not heavy, heavy; sys.exit(code)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        cwd=ROOT,
+        env={"HOME": str(tmp_path), "PATH": ""},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, out in done.stdout, error in done.stderr) == (code, True, True), done
+    assert len(done.stderr.splitlines()) == (1 if error else 0)

@@ -1,0 +1,112 @@
+import dataclasses
+import errno
+import json
+import os
+
+import numpy as np
+import pytest
+
+from experiments import results
+from experiments.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    iterations: int = 3
+    speeds: tuple[float, ...] = (0.1, 0.2)
+
+
+def test_arrays_come_back_as_they_were_saved(tmp_path):
+    arrays = {
+        "a": np.arange(6, dtype=np.float32).reshape(2, 3),
+        "b.c": np.array(True),
+        "names": np.array(["x", "yz"]),
+    }
+    results.save_arrays(tmp_path / "new" / "arrays.npz", arrays)
+    loaded = results.load_arrays(tmp_path / "new" / "arrays.npz")
+    assert loaded.keys() == arrays.keys()
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(loaded[name], values)
+        assert loaded[name].dtype == values.dtype
+
+
+def test_a_full_disk_leaves_the_earlier_file_whole_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "arrays.npz"
+    results.save_arrays(path, {"a": np.ones(3)})
+
+    def fail(_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(UserError, match=r"cannot write .*arrays\.npz: No space left on device"):
+        results.save_arrays(path, {"a": np.zeros(3)})
+    assert os.listdir(tmp_path) == ["arrays.npz"]
+    np.testing.assert_array_equal(results.load_arrays(path)["a"], np.ones(3))
+
+
+def test_a_writer_that_fails_leaves_no_trace(tmp_path):
+    def fail(file):
+        file.write(b"half")
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        results.write_atomically(tmp_path / "file", fail)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("spoil", ["missing", "folder", "empty", "text", "truncated", "pickle", "npy"])
+def test_files_that_are_no_arrays_get_one_clear_error(tmp_path, spoil):
+    path = tmp_path / "arrays.npz"
+    if spoil == "folder":
+        path.mkdir()
+    elif spoil == "empty":
+        path.write_bytes(b"")
+    elif spoil == "text":
+        path.write_text("hello")
+    elif spoil == "pickle":
+        np.savez(path, a=np.array([{}], dtype=object))
+    elif spoil == "npy":
+        with open(path, "wb") as file:
+            np.save(file, np.ones(3))
+    elif spoil == "truncated":
+        results.save_arrays(path, {"a": np.random.default_rng(0).normal(size=1000)})
+        path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(UserError, match=r"arrays\.npz") as caught:
+        results.load_arrays(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_new_folders_never_take_one_that_is_there(tmp_path):
+    folders = {results.new_folder(tmp_path / "walk", "stamp") for _ in range(3)}
+    assert {folder.name for folder in folders} == {"stamp", "stamp-2", "stamp-3"}
+
+
+def test_manifest_says_how_results_came_about(tmp_path):
+    manifest = results.make_manifest("walk", "quick", Settings(), seed=3)
+    results.save_json(tmp_path / results.MANIFEST, manifest)
+    loaded = results.load_manifest(tmp_path)
+    assert loaded["settings"] == {"iterations": 3, "speeds": [0.1, 0.2]}
+    assert (loaded["experiment"], loaded["preset"], loaded["seed"]) == ("walk", "quick", 3)
+    assert loaded["packages"].keys() >= {"jax", "numpy", "mujoco"}
+    assert all(loaded[name] for name in ("version", "python", "processor", "cores", "started"))
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"experiment": "walk"}'])
+def test_a_manifest_that_is_none_gets_one_clear_error(tmp_path, text):
+    (tmp_path / results.MANIFEST).write_text(text)
+    with pytest.raises(UserError, match="manifest"):
+        results.load_manifest(tmp_path)
+
+
+def test_latest_folder_goes_by_start_and_status(tmp_path):
+    for name, started, status in (
+        ("b", "2026-01-01", "finished"),
+        ("a", "2026-01-02", "finished"),
+        ("c", "2026-01-03", "running"),
+    ):
+        (tmp_path / "walk" / name).mkdir(parents=True)
+        manifest = {"settings": {}, "started": started, "status": status}
+        (tmp_path / "walk" / name / results.MANIFEST).write_text(json.dumps(manifest))
+    assert results.latest_folder("walk", status="finished", root=tmp_path).name == "a"
+    assert results.latest_folder("walk", root=tmp_path).name == "c"
+    assert results.latest_folder("other", root=tmp_path) is None

@@ -1,0 +1,140 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments import learning, registry, results, runner
+from experiments.cli import main
+from experiments.errors import UserError
+from experiments.runner import Request
+
+
+def run(said=None, **request):
+    return runner.run(Request("tiny", **request), console=None, say=(said if said is not None else []).append)
+
+
+def interrupt_after(monkeypatch, iterations: int, error: BaseException) -> None:
+    """Let learning fail once so many iterations are done."""
+    take = learning._Keeper.take
+
+    def take_then_fail(keeper, state, log):
+        take(keeper, state, log)
+        if len(keeper.latest.log["mean_reward"]) == iterations:
+            raise error
+
+    monkeypatch.setattr(learning._Keeper, "take", take_then_fail)
+
+
+def test_a_run_leaves_arrays_manifest_figure_and_claims(tiny):
+    folder = run(seed=3)
+    assert folder.parent == Path("results/tiny")
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"arrays.npz", "manifest.json", "curve.png", "claims.md", "checkpoint-tiny.npz"}
+    arrays = results.load_arrays(folder / "arrays.npz")
+    assert arrays["reward"].shape == (2, 4)
+    assert arrays["coef"].shape == (2, 4, 2, 1)
+    manifest = results.load_manifest(folder)
+    assert (manifest["status"], manifest["seed"], manifest["preset"]) == ("finished", 3, "quick")
+    assert manifest["seconds"] > 0
+    assert results.latest_folder("tiny", status="finished") == folder
+
+
+def test_overrides_take_the_place_of_settings(tiny):
+    folder = run(overrides={"iterations": 2, "trials": 2}, out=Path("here"))
+    assert results.load_arrays(folder / "arrays.npz")["reward"].shape == (2, 2)
+    assert results.load_manifest(folder)["settings"]["iterations"] == 2
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), UserError("disk full"), RuntimeError("bug")])
+def test_a_run_that_stopped_goes_on_with_the_same_numbers(tiny, monkeypatch, error):
+    whole = results.load_arrays(run() / "arrays.npz")
+    said = []
+    with monkeypatch.context() as patch, pytest.raises(type(error)):
+        interrupt_after(patch, 2, error)
+        run(said, out=Path("part"))
+    status = results.load_manifest(Path("part"))["status"]
+    assert status == ("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+    assert not isinstance(error, KeyboardInterrupt) or "--resume --out part" in said[-1]
+    resumed = results.load_arrays(run(out=Path("part"), resume=True) / "arrays.npz")
+    for name, values in whole.items():
+        np.testing.assert_array_equal(resumed[name], values)
+    assert results.load_manifest(Path("part"))["status"] == "finished"
+
+
+def test_resume_finds_the_latest_unfinished_run_and_can_lengthen_it(tiny, monkeypatch):
+    run()
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        interrupt_after(patch, 1, KeyboardInterrupt())
+        run()
+    folder = run(resume=True, overrides={"iterations": 6})
+    longer = results.load_arrays(folder / "arrays.npz")
+    assert longer["reward"].shape == (2, 6)
+    np.testing.assert_array_equal(
+        longer["reward"], results.load_arrays(run(preset="long") / "arrays.npz")["reward"]
+    )
+    with pytest.raises(UserError, match="no unfinished run"):
+        run(resume=True)
+
+
+def test_a_checkpoint_that_is_cut_short_is_named_and_left_alone(tiny, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        interrupt_after(patch, 2, KeyboardInterrupt())
+        run(out=Path("part"))
+    path = Path("part/checkpoint-tiny.npz")
+    path.write_bytes(path.read_bytes()[:-50])
+    cut = path.read_bytes()
+    with pytest.raises(UserError, match=r"checkpoint-tiny\.npz"):
+        run(out=Path("part"), resume=True)
+    assert path.read_bytes() == cut
+
+
+def test_mistakes_in_a_request_are_named_and_change_nothing(tiny):
+    folder = run(overrides={"iterations": 1}, out=Path("done"))
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    Path("file").write_text("")
+    Path("empty").mkdir()
+    for match, request in (
+        ("unknown preset 'quik', did you mean 'quick'", {"preset": "quik"}),
+        ("done holds a run already: add --resume", {"out": Path("done")}),
+        ("file is a file", {"out": Path("file")}),
+        ("empty is no result folder", {"out": Path("empty"), "resume": True}),
+        ("has seed 0, not 5", {"out": Path("done"), "resume": True, "seed": 5}),
+        ("has preset 'quick', not 'long'", {"out": Path("done"), "resume": True, "preset": "long"}),
+        ("iterations must be at least 1, got 0", {"overrides": {"iterations": 0}}),
+        ("tiny has no setting 'samples'", {"overrides": {"samples": 3}}),
+    ):
+        with pytest.raises(UserError, match=match):
+            run(**request)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert not Path("results").exists()
+
+
+def test_settings_of_another_version_are_named(tiny):
+    folder = run(overrides={"iterations": 1}, out=Path("done"))
+    manifest = results.load_manifest(folder)
+    (folder / "manifest.json").write_text(json.dumps({**manifest, "settings": {"foo": 1}}))
+    with pytest.raises(UserError, match="other settings"):
+        run(out=folder, resume=True)
+
+
+def test_plot_and_check_use_the_latest_results(tiny, capsys):
+    assert main(["plot", "tiny"]) == 2
+    folder = run(overrides={"iterations": 1})
+    (folder / "curve.png").unlink()
+    assert main(["plot", "tiny"]) == 0
+    assert (folder / "curve.png").exists()
+    assert main(["check", "tiny"]) == 0
+    tiny.CLAIMS = (registry.Claim("last reward", None, lambda arrays: arrays["reward"].mean(), low=1e3),)
+    assert main(["check", "tiny"]) == 1
+    assert "| NO |" in " ".join(capsys.readouterr().out.split())
+
+
+def test_the_command_runs_resumes_and_reports_mistakes(tiny, capsys, monkeypatch):
+    with monkeypatch.context() as patch:
+        interrupt_after(patch, 1, KeyboardInterrupt())
+        assert main(["run", "tiny", "--out", "part", "--seed", "1"]) == 130
+    assert main(["run", "tiny", "--resume", "--out", "part"]) == 0
+    assert "iteration 4/4" in capsys.readouterr().out
+    assert main(["run", "tiny", "--out", "part"]) == 2
+    assert capsys.readouterr().err.startswith("error: part holds a run already")

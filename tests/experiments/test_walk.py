@@ -1,0 +1,126 @@
+"""The walking experiment with a stand-in for the physics: everything but the robot."""
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from creps_jax.constraints import sigmoid_gate
+from creps_jax.contexts import gaussian_contexts
+from creps_jax.motion.walking.params import PARAM_NAMES
+from creps_jax.tasks.base import Task
+from creps_jax.tasks.nao_walk import WalkOutcome
+from experiments import results, runner, walk, walking_policy
+from experiments.cli import main
+from experiments.errors import UserError
+from experiments.policy_file import load_policy
+from experiments.video import Clip, VideoError
+
+
+def stand_in(settings) -> Task:
+    """Return a task in which the step length over the step duration is the speed."""
+
+    def rollout(key, context, theta):
+        low, high = (jnp.array(bound) for bound in walk.BOUNDS[settings.bounds])
+        theta = sigmoid_gate(theta, low, high)
+        speed = jnp.stack([theta[7] / theta[3], jnp.zeros_like(theta[0])])
+        fell = speed[0] > 0.9
+        reward = -10.0 * (speed[0] - context[0]) ** 2 - 100.0 * fell.astype(jnp.float32)
+        return WalkOutcome(reward, jnp.zeros(0), fell, speed, jnp.float32(settings.duration))
+
+    sample_context = gaussian_contexts(settings.low, settings.high, clip=True)
+    return Task(sample_context, rollout, context_dim=1, theta_dim=len(PARAM_NAMES), worst_reward=-200.0)
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    """Work in an empty folder, without physics and without a camera."""
+    filmed = []
+    clips = [Clip("asked 0.30 m/s, reached 0.30 m/s", np.zeros((5, 29)), 0.02)]
+    settings = walk.Settings(iterations=2, trials=2, eval_seeds=3, first_samples=30, samples=30)
+    monkeypatch.setattr(walk, "make_task", stand_in)
+    for module in (walk, walking_policy):
+        monkeypatch.setattr(module, "record", lambda policy, speeds, **_: (policy.theta(speeds[0]), clips)[1])
+    monkeypatch.setattr(walking_policy, "write_video", lambda path, *_, **__: filmed.append(path))
+    monkeypatch.setattr(walk, "SETTINGS", {"quick": settings})
+    monkeypatch.chdir(tmp_path)
+    return filmed
+
+
+def test_the_result_folder_is_complete(bench):
+    folder = runner.run(runner.Request("walk"), console=None, say=lambda _: None)
+    files = "arrays.npz manifest.json checkpoint-walk.npz claims.md policy.npz table.csv table.md"
+    figures = "learning_curve.png parameters.png speed.png"
+    assert {path.name for path in folder.iterdir()} == {*files.split(), *figures.split()}
+    assert bench == [folder / "walk.mp4"]
+    arrays = results.load_arrays(folder / "arrays.npz")
+    assert arrays["reward"].shape == (2, 11, 3)
+    assert arrays["speed"].shape == (2, 11, 3, 2)
+    assert arrays["fine_theta"].shape == (2, 51, 10)
+    np.testing.assert_array_equal(arrays["episodes"], [90, 180])
+
+    # The file's policy does what was evaluated, and the table says so.
+    policy, trial = load_policy(folder / "policy.npz"), walk.chosen_trial(arrays)
+    reached = [policy.theta(float(speed))[7] / policy.theta(float(speed))[3] for speed in arrays["speeds"]]
+    np.testing.assert_allclose(arrays["speed"][trial, :, 0, 0], reached, rtol=1e-4)
+    with (folder / "table.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    np.testing.assert_allclose([float(row["reached m/s"]) for row in rows], reached, rtol=1e-4)
+    assert rows[0]["paper RBF"] == "-0.166"
+
+    said = []
+    walking_policy.show(0.3, None, out=None, seed=0, say=said.append)
+    assert said[0] == f"policy: {folder / 'policy.npz'}"
+    assert said[-1] == "video: results/walk/walk-0.30.mp4"
+
+
+def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
+    monkeypatch.setattr(walking_policy, "policies_folder", lambda: Path("none"))
+    Path("bad.npz").write_text("no policy")
+    for match, arguments in (
+        ("no policy has been learned yet", ["run", "walk", "--speed", "0.3"]),
+        ("cannot read bad.npz", ["run", "walk", "--speed", "0.3", "--policy", "bad.npz"]),
+        ("no such file: none.npz", ["video", "--policy", "none.npz"]),
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert match in error
+        assert len(error.splitlines()) == 1
+    settings = walk.SETTINGS["quick"]
+    walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
+    assert main(["run", "walk", "--speed", "0.9", "--policy", "p.npz"]) == 2
+    assert "within the learned range, 0.1 to 0.6 m/s, got 0.9" in capsys.readouterr().err
+    assert main(["run", "walk", "--speed", "0.5", "--policy", "p.npz"]) == 0
+
+
+def test_a_machine_without_opengl_only_lacks_the_video(bench, monkeypatch):
+    def fail(*_, **__):
+        raise VideoError("no video: OpenGL is not to be had; apt-get install ...")
+
+    monkeypatch.setattr(walking_policy, "write_video", fail)
+    settings, said = walk.SETTINGS["quick"], []
+    walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
+    walking_policy.show(0.3, Path("p.npz"), out=None, seed=0, say=said.append)
+    assert said[-2].startswith("asked 0.30")
+    assert "apt-get" in said[-1]
+
+
+@pytest.mark.parametrize("kind", ["linear", "rbf"])
+def test_the_first_policy_is_the_same_for_every_speed(kind):
+    settings = walk.Settings(features=walk.Features(kind), start_mean=-0.5, low=0.1, high=0.6)
+    policy = walk.saved_policy(settings, walk.first_policy(settings))
+    for speed in (0.1, 0.25, 0.6):
+        np.testing.assert_allclose(policy.mean(speed), np.full(10, -0.5), rtol=1e-5)
+
+
+def test_settings_come_back_from_a_manifest():
+    settings = walk.Settings(features=walk.Features("linear"))
+    assert walk.Settings(**dataclasses.asdict(settings)) == settings
+
+
+def test_unknown_bounds_are_refused():
+    with pytest.raises(UserError, match="bounds must be one of nao, paper, got 'moon'"):
+        walk.Settings(bounds="moon")

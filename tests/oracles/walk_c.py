@@ -1,0 +1,62 @@
+"""Walk the NAO in C MuJoCo, with a loop of its own around the same engine."""
+
+import jax
+import mujoco
+import numpy as np
+
+from creps_jax.motion.nao_geometry import MAX_JOINT_SPEED
+from creps_jax.motion.walking.engine import joint_targets, plan_walk
+from creps_jax.motion.walking.params import params_from_theta
+
+CONTROL_PERIOD = 0.02
+NUM_STEPS = 60
+
+
+@jax.jit
+def _targets(theta, time, measured):
+    params = params_from_theta(theta)
+    return joint_targets(params, plan_walk(params, NUM_STEPS), time, measured, heading_gain=0.3)
+
+
+def servo_step(model, data, before, after):
+    """Move the set-points at constant speed through one control step, and tell the servos that speed."""
+    substeps = round(CONTROL_PERIOD / model.opt.timestep)
+    lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] * (after - before) / CONTROL_PERIOD
+    for k in range(1, substeps + 1):
+        data.ctrl[:] = before + k / substeps * (after - before) + lead
+        mujoco.mj_step(model, data)
+
+
+def lean_of(quat):
+    """Return roll, pitch and yaw of a wxyz quaternion."""
+    w, x, y, z = quat
+    return np.array(
+        [
+            np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+            np.arcsin(np.clip(2 * (w * y - z * x), -1, 1)),
+            np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+        ]
+    )
+
+
+def walk(model, qpos, theta, *, duration, noise, seed):
+    """Walk from a position; return forward speed after 2 s and whether the robot fell."""
+    rng = np.random.default_rng(seed)
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    data.qpos[7:] += noise * rng.standard_normal(model.nu)
+    set_point, start_x = np.array(qpos[7:], float), 0.0
+    for tick in range(round(duration / CONTROL_PERIOD)):
+        measured = lean_of(data.qpos[3:7]) + noise * rng.standard_normal(3)
+        time = np.float32((tick + 1) * CONTROL_PERIOD)
+        target = np.asarray(_targets(theta, time, measured.astype(np.float32)), float)
+        target = target + noise * rng.standard_normal(model.nu)
+        slew = MAX_JOINT_SPEED * CONTROL_PERIOD
+        target = set_point + np.clip(target - set_point, -slew, slew)
+        servo_step(model, data, set_point, target)
+        set_point = target
+        if tick == round(2.0 / CONTROL_PERIOD) - 1:
+            start_x = data.qpos[0]
+        if data.qpos[2] < 0.2:
+            return 0.0, True
+    return (data.qpos[0] - start_x) / (duration - 2.0), False
