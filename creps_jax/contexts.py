@@ -40,7 +40,7 @@ def gaussian_contexts(
     middle, scale = (low + high) / 2, np.broadcast_to(scale, low.shape)
 
     def sample_context(key: PRNGKey) -> Float[Array, " s"]:
-        context = middle + scale * jax.random.normal(key, low.shape)
+        context = jnp.asarray(middle) + scale * jax.random.normal(key, low.shape)
         return jnp.clip(context, low, high) if clip else context
 
     return sample_context

@@ -120,7 +120,7 @@ def weighted_ridge(
     rows = root * jnp.where(is_weighted, features, 0.0)
     values = root * jnp.where(is_weighted, targets, 0.0)
     size = jnp.linalg.norm(rows, axis=0)
-    size = jnp.where(size > 0, size, 1.0)
+    size = jnp.asarray(jnp.where(size > 0, size, 1.0))
     damping = jnp.sqrt(jnp.maximum(jnp.asarray(ridge, features.dtype), num_features * (4.0 * eps) ** 2))
     penalty = damping * jnp.eye(num_features, dtype=features.dtype)
     orthogonal, triangular = jnp.linalg.qr(jnp.concatenate([rows / size[None, :], penalty]))

@@ -53,8 +53,8 @@ class Settings:
         duration: length of an episode, s.
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
         sampler: how contexts are drawn in learning, a name in SAMPLERS.
-        learning_noise: how many times larger the noise is in learning than in the evaluation: a policy that has learned to
-            stay up in more of it falls less.
+        learning_noise: how many times larger the noise is in learning than in the evaluation: a policy
+            that has learned to stay up in more of it falls less.
         eval_seeds: fresh episodes at each speed of the table.
     """
 

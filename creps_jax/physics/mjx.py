@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -42,8 +41,9 @@ def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:
 def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     """Return the function that steps the robot through one control step.
 
-    The set-points of the servos move at constant speed from the ones before to the ones after. Each servo is told that speed
-    too, so that its damping acts on the error of the speed and not on the motion itself.
+    The set-points of the servos move at constant speed from the ones before to the ones after. Each servo
+    is told that speed too, so that its damping acts on the error of the speed and not on the motion
+    itself.
 
     Args:
         model: A model all of whose actuators are position servos.
@@ -59,7 +59,8 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
         raise ValueError(f"num_substeps must be at least 1, got {num_substeps}")
     speed_lead = _speed_lead(model)
     device_model = mjx.put_model(model)
-    # Only what the state holds goes round the loop; the rest of mjx.Data is made anew in each step and costs nothing.
+    # Only what the state holds goes round the loop; the rest of mjx.Data is made anew in each step and
+    # costs nothing.
     blank = mjx.make_data(model)
     control_period = num_substeps * model.opt.timestep
 
@@ -85,7 +86,7 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
 
 
 def _speed_lead(model: mujoco.MjModel) -> np.ndarray:
-    """Return by how much, per speed, a set-point is to run ahead: the servo's damping over its stiffness, s."""
+    """Return by how much, per speed, a set-point is to run ahead: damping over stiffness of the servo, s."""
     stiffness, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
     is_servo = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (stiffness > 0)
     is_servo &= model.actuator_biasprm[:, 1] == -stiffness

@@ -1,4 +1,4 @@
-"""The walking task: a simulated NAO walks straight ahead from standstill at the speed that the context asks for."""
+"""The walking task: a simulated NAO walks straight ahead, from standstill, at the speed it is asked for."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +14,7 @@ from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, MAX_JOINT_SPEED
 from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints
 from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, params_from_theta
 from creps_jax.physics.mjx import RobotState, initial_state, make_control_step
-from creps_jax.rotations import quat_to_matrix, matrix_to_rpy, rotation_y, rpy_to_quat
+from creps_jax.rotations import matrix_to_rpy, quat_to_matrix, rotation_y, rpy_to_quat
 from creps_jax.tasks.base import Task
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
 
@@ -29,7 +29,7 @@ _SHORTEST_STEP = 0.08
 
 
 class WalkReward(NamedTuple):
-    """Weights of the reward, `-speed (vx - s)^2 - drift vy^2 - fall [fell]` (Abdolmaleki et al. 2016, Eq. 18)."""
+    """Weights of the reward, `-speed (vx - s)^2 - drift vy^2 - fall [fell]` (the paper's Eq. 18)."""
 
     speed: float = 10.0
     drift: float = 1.0
@@ -37,7 +37,7 @@ class WalkReward(NamedTuple):
 
 
 class WalkNoise(NamedTuple):
-    """Standard deviations of the noise: measured roll, pitch and yaw, set-points, and joints at the start; rad."""
+    """Standard deviations of the noise on measured angles, set-points and joints at the start, rad."""
 
     lean: float = 0.01
     set_point: float = 0.01
@@ -104,8 +104,8 @@ class _Progress(NamedTuple):
 def load_nao() -> mujoco.MjModel:
     """Load the NAO for simulation, from the checkout or from the installed package.
 
-    What is only there to be looked at is left out. So are the joint limits' constraints, a third of all constraint rows: the
-    set-points keep within the limits, and the servos hold the joints near them.
+    What is only there to be looked at is left out. So are the joint limits' constraints, a third of all
+    constraint rows: the set-points keep within the limits, and the servos hold the joints near them.
 
     Raises:
         FileNotFoundError: If the model file is in neither place.
@@ -134,11 +134,11 @@ def nao_walk(
     heading_gain: float = 0.0,
     model: mujoco.MjModel | None = None,
 ) -> Task:
-    """Make the walking task: context the asked speed (m/s), theta the ten walking parameters in the paper's order and units.
+    """Make the walking task: the context is the asked speed in m/s, theta the ten walking parameters.
 
-    The robot starts from standstill and walks straight ahead. Its speed is the displacement of the torso, in the frame of the
-    start, over the time from the end of the start-up to the end of the episode. A fall ends the episode, and the speed up to
-    it counts.
+    Theta has the paper's order and units. The robot starts from standstill and walks straight ahead. Its
+    speed is the displacement of the torso, in the frame of the start, over the time from the end of the
+    start-up to the end of the episode. A fall ends the episode, and the speed up to it counts.
 
     Args:
         low: Lowest speed that is asked for, m/s.
@@ -155,7 +155,8 @@ def nao_walk(
         The task. Its rollout is for one robot; vmap it for a batch.
 
     Raises:
-        ValueError: If the range or the times are not in order, or the model is not driven by the NAO's joints.
+        ValueError: If the range or the times are not in order, or the model is not driven by the NAO's
+            joints.
 
     Source: Abdolmaleki et al. 2016, Section 4.3.
     """
@@ -178,7 +179,8 @@ def nao_walk(
         def step(progress):
             robot, set_point = advance(walk, progress.tick, progress.robot, progress.set_point)
             tick = progress.tick + 1
-            measured_from = jnp.where(tick <= start_up_ticks, robot.qpos[:2], progress.measured_from)
+            is_start_up = tick <= start_up_ticks
+            measured_from = lax.select(is_start_up, robot.qpos[:2], progress.measured_from)
             return _Progress(tick, robot, set_point, measured_from, _has_fallen(robot.qpos))
 
         end = lax.while_loop(is_walking, step, start)
@@ -233,7 +235,7 @@ def record_walk(
 
 
 def _make_walker(model, duration, noise, heading_gain):
-    """Return `begin(key, theta)` and `advance(walk, tick, robot, set_point)`, shared by rollout and record."""
+    """Return `begin(key, theta)` and `advance(walk, tick, robot, set_point)`, for rollout and record."""
     model = load_nao() if model is None else model
     _check_model(model)
     control_step = make_control_step(model, round(CONTROL_PERIOD / model.opt.timestep))
@@ -285,7 +287,7 @@ def _has_fallen(qpos: Array) -> Array:
 
 
 def _check_model(model: mujoco.MjModel) -> None:
-    """Refuse a model whose actuators are not the NAO's joints in order, or whose steps do not divide a control step."""
+    """Refuse a model with other actuators, or with a time step that does not divide a control step."""
     names = tuple(model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu))
     if names != JOINT_NAMES:
         raise ValueError(f"the model's actuators must drive {JOINT_NAMES} in this order, got {names}")

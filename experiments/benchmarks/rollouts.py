@@ -1,9 +1,9 @@
-"""Compare the speed of walking rollouts: all devices, one device, and bare C MuJoCo at the same solver setting.
+"""Compare the speed of walking rollouts: all devices, one device, bare C MuJoCo at the same setting.
 
     python -m experiments.benchmarks.rollouts
 
-Each round runs all three in turn; the ratios are medians over the rounds. Ours have the controller in the loop; C MuJoCo replays
-the set-points of such a walk with `mujoco.rollout`, one thread a core.
+Each round runs all three in turn; the ratios are medians over the rounds. Ours have the controller in the
+loop; C MuJoCo replays the set-points of such a walk with `mujoco.rollout`, one thread a core.
 """
 
 from experiments.process import import_mjx_quietly, prepare, usable_cores
@@ -47,7 +47,8 @@ def main() -> None:
             begin = time.perf_counter()
             run()
             rates[name].append(steps / (time.perf_counter() - begin))
-    print(f"{cores} cores, {jax.device_count()} devices, batch {BATCH}, {ROUNDS} rounds; physics steps a second, median:")
+    print(f"{cores} cores, {jax.device_count()} devices, batch {BATCH}, {ROUNDS} rounds")
+    print("physics steps a second, median (least to most):")
     for name, values in rates.items():
         print(f"  {name:12} {np.median(values):10,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
     ours = np.array(rates["all devices"])

@@ -20,7 +20,7 @@ from experiments.policy_file import load_policy
 from experiments.video import Clip, VideoError
 
 
-def stand_in(settings) -> Task:
+def stand_in(settings, **_) -> Task:
     """Return a task in which the step length over the step duration is the speed."""
 
     def rollout(key, context, theta):

@@ -25,7 +25,9 @@ def sideways_zmp(double_support_share):
 def test_com_gives_its_zmp_back(duration, amplitude_share):
     amplitude = amplitude_share * GRAVITY * duration**2 / (4 * math.pi**2)
     amplitude = min(amplitude, 0.03)
-    height, height_acc = spring_height(PHASE, jnp.float32(0.26), jnp.float32(amplitude), jnp.float32(duration))
+    height, height_acc = spring_height(
+        PHASE, jnp.float32(0.26), jnp.float32(amplitude), jnp.float32(duration)
+    )
     zmp = sideways_zmp(0.2)
     com = com_trajectory(zmp, height, height_acc, 0.0, 0.0, duration)
     given_back = zmp_of_com(com, height, height_acc, duration)
@@ -52,11 +54,19 @@ def test_com_agrees_with_a_dense_solve_of_the_zmp_equation():
 
 @pytest.mark.parametrize(
     ("duration", "amplitude", "sway"),
-    [(0.16, 0.0, 0.0059), (0.20, 0.0, 0.0088), (0.24, 0.0, 0.0120), (0.40, 0.0, 0.0250), (0.24, 0.01, 0.0147)],
+    [
+        (0.16, 0.0, 0.0059),
+        (0.20, 0.0, 0.0088),
+        (0.24, 0.0, 0.0120),
+        (0.40, 0.0, 0.0250),
+        (0.24, 0.01, 0.0147),
+    ],
 )
 def test_sway_is_that_of_a_pendulum_with_the_right_sign(duration, amplitude, sway):
     # Computed apart for a height of .265 m and feet at +-.055 m; with g - z'' the last one would be .0091.
-    height, height_acc = spring_height(PHASE, jnp.float32(0.265), jnp.float32(amplitude), jnp.float32(duration))
+    height, height_acc = spring_height(
+        PHASE, jnp.float32(0.265), jnp.float32(amplitude), jnp.float32(duration)
+    )
     com = com_trajectory(sideways_zmp(0.0), height, height_acc, 0.0, 0.0, duration)
     np.testing.assert_allclose(jnp.max(com), sway, atol=2e-4)
 
@@ -67,7 +77,9 @@ def test_spring_acceleration_is_the_second_derivative_of_its_height():
 
     for time in (0.0, 0.07, 0.2):
         derivative = jax.grad(jax.grad(height))(jnp.float32(time))
-        acceleration = spring_height(jnp.float32(time) / 0.3, jnp.float32(0.2), jnp.float32(0.01), jnp.float32(0.3))[1]
+        acceleration = spring_height(
+            jnp.float32(time) / 0.3, jnp.float32(0.2), jnp.float32(0.01), jnp.float32(0.3)
+        )[1]
         np.testing.assert_allclose(derivative, acceleration, rtol=1e-4, atol=1e-4)
 
 

@@ -7,7 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, LEFT, RIGHT, leg_indices
+from creps_jax.motion.nao_geometry import (
+    GEOMETRY,
+    JOINT_LOWER,
+    JOINT_NAMES,
+    JOINT_UPPER,
+    LEFT,
+    RIGHT,
+    leg_indices,
+)
 from creps_jax.motion.nao_kinematics import leg_fk
 from creps_jax.motion.walking.engine import joint_targets, plan_step, plan_walk, pose_at
 from creps_jax.motion.walking.footsteps import FOOT_SPACING, next_footstep, standing
@@ -75,7 +83,9 @@ def test_wild_thetas_and_times_give_finite_targets(theta, time):
 def test_params_of_a_sensible_theta_are_the_theta_in_si_units():
     theta = THETA.at[4].set(3.0)
     params = params_from_theta(theta)
-    np.testing.assert_allclose(jnp.stack(params)[jnp.array([0, 1, 2, 3, 5, 6, 7, 8, 9])], jnp.delete(theta, 4), rtol=1e-6)
+    np.testing.assert_allclose(
+        jnp.stack(params)[jnp.array([0, 1, 2, 3, 5, 6, 7, 8, 9])], jnp.delete(theta, 4), rtol=1e-6
+    )
     np.testing.assert_allclose(params.lean, np.radians(3.0), rtol=1e-6)
 
 
@@ -98,7 +108,9 @@ def test_steps_grow_from_standstill_to_the_wanted_length():
     np.testing.assert_allclose(plan.footstep.swing_end[1::2, 1], FOOT_SPACING / 2, atol=1e-6)
 
 
-@pytest.mark.parametrize("command", [(0.0, 0.03, 0.0), (0.0, -0.03, 0.0), (0.03, 0.0, 0.2), (0.05, 0.02, -0.2)])
+@pytest.mark.parametrize(
+    "command", [(0.0, 0.03, 0.0), (0.0, -0.03, 0.0), (0.03, 0.0, 0.2), (0.05, 0.02, -0.2)]
+)
 def test_the_engine_walks_in_every_direction(command):
     plan = walk_of(THETA, jnp.array(command))
     middles = np.asarray(0.5 * (plan.footstep.support + plan.footstep.swing_end))
@@ -115,7 +127,8 @@ def test_the_engine_walks_in_every_direction(command):
 
 def test_turning_mirrors():
     left, right = walk_of(THETA, jnp.array([0.04, 0.02, 0.2])), walk_of(THETA, jnp.array([0.04, -0.02, -0.2]))
-    # The first step is always with the same foot, so walks mirror from the second one on, one step apart at most.
+    # The first step is always with the same foot, so walks mirror from the second one on, one step apart
+    # at most.
     last_left = np.asarray(0.5 * (left.footstep.support + left.footstep.swing_end))[-1]
     last_right = np.asarray(0.5 * (right.footstep.support + right.footstep.swing_end))[-1]
     np.testing.assert_allclose(last_left[2], -last_right[2], atol=0.21)

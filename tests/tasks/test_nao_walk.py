@@ -80,7 +80,9 @@ def test_speed_and_falls_agree_with_c_mujoco(outcome):
     for row, theta in ((1, MIDDLE), (2, FAST)):
         theta = jnp.array(theta)
         start = _start_of(theta)
-        walks = [walk_c.walk(model, start, theta, duration=DURATION, noise=0.01, seed=seed) for seed in range(3)]
+        walks = [
+            walk_c.walk(model, start, theta, duration=DURATION, noise=0.01, seed=seed) for seed in range(3)
+        ]
         speeds = np.array([speed for speed, _ in walks])
         assert not any(fell for _, fell in walks)
         spread = max(float(np.std(outcome.speed[row, :, 0])), 0.005)
@@ -96,7 +98,9 @@ def _start_of(theta):
 def test_the_solver_is_converged_on_walking_gaits(outcome):
     model = load_nao()
     model.opt.iterations, model.opt.ls_iterations = 30, 30
-    reference = rolled_out(nao_walk(duration=DURATION, heading_gain=GAIN, model=model), [SLOW, MIDDLE, FAST], SEEDS)
+    reference = rolled_out(
+        nao_walk(duration=DURATION, heading_gain=GAIN, model=model), [SLOW, MIDDLE, FAST], SEEDS
+    )
     np.testing.assert_array_equal(reference.fell, outcome.fell[:3])
     np.testing.assert_allclose(
         reference.speed[..., 0].mean(axis=1), outcome.speed[:3, :, 0].mean(axis=1), atol=0.01
@@ -124,7 +128,9 @@ def test_another_robot_is_an_error():
 
 
 def test_a_state_that_is_not_finite_ends_the_episode_as_a_failure():
-    broken = nao_walk(duration=0.2, start_up=0.0, noise=WalkNoise(lean=0.01, set_point=float("nan"), start=0.0))
+    broken = nao_walk(
+        duration=0.2, start_up=0.0, noise=WalkNoise(lean=0.01, set_point=float("nan"), start=0.0)
+    )
     outcome = rolled_out(broken, [MIDDLE], 1)
     assert not np.isfinite(outcome.reward).any()
     assert outcome.seconds[0, 0] < 0.2

@@ -1,4 +1,4 @@
-"""Plan the centre of mass of one step from its ZMP reference: a spring-mass pendulum, solved as a tridiagonal system."""
+"""Plan the centre of mass of one step from its ZMP reference: a spring-mass pendulum, solved at once."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Turn walking parameters into joint targets: plan a step, pose the body at a time, pose the joints for the measured lean."""
+"""Turn walking parameters into joint targets: plan a step, pose body and joints."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from creps_jax.motion.walking.params import WalkParams
 from creps_jax.motion.walking.posture import corrected_lean
 from creps_jax.motion.walking.swing import swing_pose
 from creps_jax.motion.walking.zmp import zmp_reference
-from creps_jax.rotations import rigid_transform, rotation_y, rotation_x, rotation_z
+from creps_jax.rotations import rigid_transform, rotation_x, rotation_y, rotation_z
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
 __all__ = ["BodyPose", "StepPlan", "body_pose", "joint_targets", "plan_step", "plan_walk", "pose_joints"]
@@ -23,11 +23,13 @@ __all__ = ["BodyPose", "StepPlan", "body_pose", "joint_targets", "plan_step", "p
 NUM_NODES = 33
 # Height of the CoM above the middle of the hips, and of the ankle above the floor, m.
 _COM_ABOVE_HIP = 0.025
-# The foot's "centre", where the ZMP is to be, lies ahead of the ankle by this much, m; the CoM is planned above it.
+# The foot's "centre", where the ZMP is to be, lies ahead of the ankle by this much, m; the CoM is planned
+# above it.
 _CENTRE_AHEAD_OF_ANKLE = 0.02
 # ... and the CoM is ahead of the hips by this much, m.
 _COM_AHEAD_OF_HIP = 0.01
-# Swing of the shoulders against the legs, rad for each metre that the other foot is ahead, and the arms' posture, rad.
+# Swing of the shoulders against the legs, rad for each metre that the other foot is ahead, and the arms'
+# posture, rad.
 _ARM_SWING = 5.0
 _SHOULDER_PITCH = -1.6
 _SHOULDER_YAW = 0.1
@@ -57,8 +59,8 @@ class BodyPose(NamedTuple):
         hips: Position (x, y, z) and yaw of the middle of the hips.
         left: Position (x, y, z) and yaw of the left sole, below the ankle.
         right: That of the right sole.
-        turn: Share of a turn of the trunk in the coming step by which the left foot is turned outwards already; the right
-            foot by the opposite.
+        turn: Share of a turn of the trunk in the coming step by which the left foot is turned outwards
+            already; the right foot by the opposite.
     """
 
     hips: Float[Array, "4"]
@@ -98,7 +100,8 @@ def plan_walk(params: WalkParams, num_steps: int, command: Float[Array, "3"] | N
     Args:
         params: Walking parameters.
         num_steps: Number of steps.
-        command: Wanted displacement of the body in one step; straight ahead by `params.step_length` if left out.
+        command: Wanted displacement of the body in one step; straight ahead by `params.step_length` if
+            left out.
 
     Returns:
         The plans of the steps, stacked along a leading axis.
@@ -152,7 +155,7 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
 
 
 def _above_floor(foot, height):
-    """Position and yaw of the sole below the ankle, from the planar pose of the foot's centre and its height."""
+    """Place the sole below the ankle, from the planar pose and height of the foot's centre."""
     x, y, yaw = foot
     back = _CENTRE_AHEAD_OF_ANKLE
     return jnp.stack([x - back * jnp.cos(yaw), y - back * jnp.sin(yaw), height, yaw])
@@ -166,9 +169,10 @@ def pose_joints(
     Args:
         params: Walking parameters.
         pose: Where hips and feet shall be.
-        measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw relative to the planned heading's origin.
-        heading_gain: Share of the heading error that one step turns back; 0 is the paper's engine, which leaves the heading
-            alone.
+        measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw relative to the planned
+            heading's origin.
+        heading_gain: Share of the heading error that one step turns back; 0 is the paper's engine, which
+            leaves the heading alone.
 
     Returns:
         Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad, within the joint limits.

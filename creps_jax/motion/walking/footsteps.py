@@ -11,11 +11,12 @@ __all__ = ["FOOT_SPACING", "Footstep", "Stance", "next_footstep", "standing"]
 
 # Distance of the two feet when standing: that of the hips (SimSpark NAO type 0), m.
 FOOT_SPACING = 0.11
-# Where the swing foot may land, seen from the support foot: forward, sideways on its own side (reach and collision), turned; m
-# and rad. The body stays within half of that box.
+# Where the swing foot may land, seen from the support foot: forward, sideways on its own side (reach and
+# collision), turned; m and rad. The body stays within half of that box.
 _LANDING_LOW = (-0.20, 0.10, -0.6)
 _LANDING_HIGH = (0.20, 0.18, 0.6)
-# The swing foot aims at the pose of the body one and a half steps ahead: after one, the body is between the feet.
+# The swing foot aims at the pose of the body one and a half steps ahead: after one, the body is between
+# the feet.
 _SWING_AHEAD = 1.5
 
 
@@ -23,7 +24,8 @@ class Stance(NamedTuple):
     """Where body and feet are between two steps, and what comes next.
 
     Attributes:
-        body: Planar pose (x, y, yaw) of the body, in a steady walk the middle of the feet, in the world, m and rad.
+        body: Planar pose (x, y, yaw) of the body, in a steady walk the middle of the feet, in the world,
+            m and rad.
         left: Planar pose of the left foot's centre.
         right: That of the right foot.
         supports_left: Whether the left foot carries the coming step.
@@ -38,7 +40,7 @@ class Stance(NamedTuple):
 
 
 class Footstep(NamedTuple):
-    """One step: who stands, who swings, from where to where (planar poses x, y, yaw in the world, m and rad)."""
+    """One step: who stands, who swings, from where to where (planar poses in the world, m and rad)."""
 
     support: Float[Array, "3"]
     swing_start: Float[Array, "3"]
@@ -47,7 +49,7 @@ class Footstep(NamedTuple):
 
 
 def standing(dtype=jnp.float32) -> Stance:
-    """Return the stance of a robot that stands at the origin, looks along x and will lift its right foot first."""
+    """Return the stance of a robot that stands at the origin, looks ahead and lifts the right foot first."""
     origin = jnp.zeros(3, dtype)
     left = origin.at[1].set(0.5 * FOOT_SPACING)
     return Stance(origin, left, -left, jnp.asarray(True), origin)
@@ -73,7 +75,7 @@ def _towards(step, wanted, growth: Scalar):
 
 
 def _limit(seen, swing_side, share):
-    """Limit a pose that is seen from the support foot to a share of the box in which the swing foot may land."""
+    """Limit a pose, seen from the support foot, to a share of the box in which the swing foot may land."""
     low, high = (share * jnp.asarray(bound, seen.dtype) for bound in (_LANDING_LOW, _LANDING_HIGH))
     mirror = jnp.ones_like(seen).at[1].set(swing_side)
     return mirror * jnp.clip(mirror * seen, low, high)
@@ -82,8 +84,9 @@ def _limit(seen, swing_side, share):
 def next_footstep(params: WalkParams, stance: Stance, command: Float[Array, "3"]) -> tuple[Footstep, Stance]:
     """Plan the next step.
 
-    The step size approaches the commanded one by `step_growth * step_duration` a step. The landing place is limited to what
-    the leg reaches and to its own side of the support foot, and the body to half of that.
+    The step size approaches the commanded one by `step_growth * step_duration` a step. The landing place
+    is limited to what the leg reaches and to its own side of the support foot, and the body to half of
+    that.
 
     Args:
         params: Walking parameters.

@@ -1,4 +1,4 @@
-"""Name the ten walking parameters, with units and bounds, and turn a parameter vector into safe settings of the engine."""
+"""Name the ten walking parameters with units and bounds, and make them safe to plan with."""
 
 import math
 from typing import NamedTuple
@@ -52,7 +52,8 @@ PAPER_BOUNDS = (
     (0.0, 0.16, 0.02, 0.1, 0.0, 0.0, 0.0, 0.05, 0.0, 0.0),
     (1.0, 0.22, 0.15, 3.0, 5.0, 1.0, 1.0, 0.5, 1.0, 0.5),
 )
-# The part of that box in which a NAO can walk at all, with room for slow walking (step length from 0) and leaning back.
+# The part of that box in which a NAO can walk at all, with room for slow walking (step length from 0) and
+# leaning back.
 NAO_BOUNDS = (
     (0.0, 0.15, 0.02, 0.14, -5.0, 0.0, 0.0, 0.0, 0.0, 0.02),
     (0.01, 0.20, 0.06, 0.40, 5.0, 1.0, 1.0, 0.15, 0.1, 0.2),
@@ -61,8 +62,8 @@ NAO_BOUNDS = (
 # What the engine accepts, whatever theta says. Within it every plan is finite.
 _SAFE_LOW = (0.0, 0.10, 0.0, 0.08, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
 _SAFE_HIGH = (1.0, 0.22, 0.15, 4.0, 30.0, 2.0, 2.0, 0.2, 4.0, 10.0)
-# Amplitude at which the spring's acceleration would reach that of gravity is A = g T^2 / (4 pi^2): there the ZMP equation is
-# singular. Share of it that is allowed.
+# Amplitude at which the spring's acceleration would reach that of gravity is A = g T^2 / (4 pi^2): there
+# the ZMP equation is singular. Share of it that is allowed.
 _MAX_AMPLITUDE_SHARE = 0.6
 _MAX_AMPLITUDE = 0.05
 # Share of a step that double support may fill; the swing foot needs the rest.
@@ -102,8 +103,9 @@ class WalkParams(NamedTuple):
 def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
     """Turn a parameter vector in the paper's order and units into settings that the engine can plan with.
 
-    Any finite theta is accepted: each entry is limited to what gives a finite plan. The amplitude is limited to a share of
-    `g T^2 / (4 pi^2)`, where the ZMP equation turns singular, and double support to a share of the step.
+    Any finite theta is accepted: each entry is limited to what gives a finite plan. The amplitude is
+    limited to a share of `g T^2 / (4 pi^2)`, where the ZMP equation turns singular, and double support to
+    a share of the step.
 
     Args:
         theta: Parameters in the order of `PARAM_NAMES` and the units of `PARAM_UNITS` (the lean in degrees).

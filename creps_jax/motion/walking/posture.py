@@ -15,8 +15,9 @@ def corrected_lean(
 ) -> Float[Array, "2"]:
     """Return the roll and pitch of the trunk for which the legs are to be posed.
 
-    With gain 0 the legs are posed for the trunk as measured: the feet stay level with the floor and nothing pushes back. With
-    gain 1 they are posed as if the trunk stood as intended: a tilted robot presses the edge of its feet into the floor.
+    With gain 0 the legs are posed for the trunk as measured: the feet stay level with the floor and
+    nothing pushes back. With gain 1 they are posed as if the trunk stood as intended: a tilted robot
+    presses the edge of its feet into the floor.
 
     Args:
         intended: Intended roll and pitch, rad.

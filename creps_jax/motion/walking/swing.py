@@ -13,8 +13,8 @@ def swing_pose(
 ) -> tuple[Float[Array, "3"], Scalar]:
     """Return the planar pose and the height of the swing foot.
 
-    The foot leaves and reaches the floor at rest: the planar pose is a cubic Bezier curve with doubled end points, the height
-    two such curves, one up and one down.
+    The foot leaves and reaches the floor at rest: the planar pose is a cubic Bezier curve with doubled
+    end points, the height two such curves, one up and one down.
 
     Args:
         start: Planar pose (x, y, yaw) at the start of the swing, m and rad.

@@ -14,7 +14,7 @@ def zmp_reference(
     end: Float[Array, "2"],
     double_support_share: Scalar,
 ) -> Float[Array, "n 2"]:
-    """Move the ZMP linearly to the support foot, hold it there, move it linearly to the next middle of the feet.
+    """Move the ZMP to the support foot, hold it there, and move it on to the next middle of the feet.
 
     Half of the double support lies at each end of the step, so that two steps share one double support.
 
