@@ -45,9 +45,9 @@ import creps_jax as cj
 # entropy allows.
 
 # %%
-task = cj.sinus()
-low, high = 0.0, 5 * np.pi
-features = cj.rbf_features(low, high, 12)
+low, high = 0.0, 2 * np.pi
+task = cj.sinus(low, high)
+features = cj.rbf_features(low, high, 7)
 algorithm = cj.creps(features, features, kl_bound=0.5, archive_size=400)
 start = cj.LinearGaussian(coef=jnp.zeros((features.size, 1)), cov_chol=jnp.eye(1))
 

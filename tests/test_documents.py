@@ -16,7 +16,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 def test_readme_example_runs():
     failed, tried = doctest.testfile(str(ROOT / "README.md"), module_relative=False)
     assert failed == 0
-    assert tried >= 8
+    assert tried >= 10
 
 
 def test_there_are_notebooks():
