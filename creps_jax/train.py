@@ -4,7 +4,7 @@ Every random number of a run follows from its key and the number of the iteratio
 loop and a resumed run draw the same ones. Rollouts are shared out over the devices.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -12,18 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Key, UInt32
 
 from creps_jax.archive import Batch
 from creps_jax.creps import Creps, CrepsInfo, CrepsState
 from creps_jax.policy import LinearGaussian
+from creps_jax.rollouts import Devices, device_tuple, mean_outcome, replicate, roll_out
 from creps_jax.tasks.base import Task
 from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
 
 __all__ = ["IterationLog", "evaluate", "make_iteration", "train", "train_trials"]
 
-Devices = Sequence[jax.Device] | None
 OnIteration = Callable[[CrepsState, "IterationLog"], Any]
 
 
@@ -64,7 +63,7 @@ def make_iteration(
     Source: Abdolmaleki et al. 2016, Algorithm 1.
     """
     setup = _make_setup(task, algorithm, samples, devices)
-    return lambda key, state: _iterate(setup, key, _replicate(state, setup.devices))
+    return lambda key, state: _iterate(setup, key, replicate(state, setup.devices))
 
 
 def train(
@@ -184,7 +183,7 @@ def evaluate(
             f"got {contexts.shape} and {thetas.shape}"
         )
     contexts, thetas = (jnp.repeat(x, repeats, axis=0) for x in (contexts, thetas))
-    outcomes, _ = _roll_out(task, _as_tuple(devices), key, contexts, thetas)
+    outcomes, _ = roll_out(task, device_tuple(devices), key, contexts, thetas)
     return jax.tree.map(lambda x: x.reshape(num, repeats, *x.shape[1:]), outcomes)
 
 
@@ -200,14 +199,7 @@ class _Setup(NamedTuple):
 def _make_setup(task: Task, algorithm: Creps, samples: int, devices: Devices) -> _Setup:
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
-    return _Setup(task, algorithm, samples, _as_tuple(devices))
-
-
-def _as_tuple(devices: Devices) -> tuple[jax.Device, ...]:
-    devices = tuple(jax.local_devices() if devices is None else devices)
-    if not devices:
-        raise ValueError("devices must hold at least one device, got none")
-    return devices
+    return _Setup(task, algorithm, samples, device_tuple(devices))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -222,13 +214,13 @@ def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState
     if contexts.shape != (samples, task.context_dim):
         raise ValueError(f"sample_context must give ({task.context_dim},), got {contexts.shape[1:]}")
     thetas = algorithm.ask(theta_key, state, contexts)
-    outcomes, is_failed = _roll_out(task, devices, rollout_key, contexts, thetas)
+    outcomes, is_failed = roll_out(task, devices, rollout_key, contexts, thetas)
     state, info = algorithm.tell(state, Batch(contexts, thetas, outcomes.reward))
     log = IterationLog(
         info=info,
         mean_reward=jnp.mean(outcomes.reward),
         num_failed=jnp.sum(is_failed, dtype=jnp.int32),
-        outcome=_mean_outcome(outcomes, ~is_failed),
+        outcome=mean_outcome(outcomes, ~is_failed),
     )
     return lax.optimization_barrier((state, log))
 
@@ -273,7 +265,7 @@ def _run(
     on_iteration: OnIteration | None,
 ) -> tuple[CrepsState, IterationLog]:
     """Run all phases, as scans or as loops; return the logs on the host, stacked along a first axis."""
-    state, logs = _replicate(state, phases[0][0].devices), []
+    state, logs = replicate(state, phases[0][0].devices), []
     for setup, length in phases:
         if on_iteration is None and length > 1:
             state, log = _scan(iterate, setup, length, key, state)
@@ -285,60 +277,6 @@ def _run(
             if on_iteration is not None:
                 on_iteration(state, log)
     return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
-
-
-@partial(jax.jit, static_argnums=(0, 1))
-def _roll_out(
-    task: Task, devices: tuple[jax.Device, ...], key: Array, contexts: Array, thetas: Array
-) -> tuple[Any, Array]:
-    """Roll out a batch over the devices; return outcomes with finite rewards, and which ones failed."""
-    num = contexts.shape[0]
-    # Keys go by the number of the rollout, whatever device it runs on.
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
-    rollouts = jax.vmap(task.rollout)
-    if len(devices) > 1:
-        rollouts = _shared_out(rollouts, devices)
-    outcomes = rollouts(keys, contexts, thetas)
-    if outcomes.reward.shape != (num,):
-        raise ValueError(f"a rollout must give one reward, got shape {outcomes.reward.shape[1:]}")
-    is_failed = ~jnp.isfinite(outcomes.reward)
-    reward = jnp.where(is_failed, jnp.float32(task.worst_reward), outcomes.reward.astype(jnp.float32))
-    return outcomes._replace(reward=reward), is_failed
-
-
-def _shared_out(function: Callable, devices: tuple[jax.Device, ...]) -> Callable:
-    """Share the rows of a batch out over devices; the last row fills up what does not divide."""
-    mesh = Mesh(np.asarray(devices), ("rollouts",))
-    rows = PartitionSpec("rollouts")
-    # Unchecked, so that a rollout may start its loops from constants, as it may on one device.
-    sharded = jax.shard_map(function, mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False)
-
-    def shared_out(*batch: Array) -> Any:
-        num = batch[0].shape[0]
-        padded = -(-num // len(devices)) * len(devices)
-        index = jnp.minimum(jnp.arange(padded), num - 1)
-        results = sharded(*(x[index] for x in batch))
-        # Every device goes on with all results: the update is small, and equal on each of them.
-        results = lax.with_sharding_constraint(results, NamedSharding(mesh, PartitionSpec()))
-        return jax.tree.map(lambda x: x[:num], results)
-
-    return shared_out
-
-
-def _replicate(state: CrepsState, devices: tuple[jax.Device, ...]) -> CrepsState:
-    """Put a state where the first iteration will leave it, lest the second be compiled anew."""
-    if len(devices) == 1:
-        return state
-    mesh = Mesh(np.asarray(devices), ("rollouts",))
-    return jax.device_put(state, NamedSharding(mesh, PartitionSpec()))
-
-
-def _mean_outcome(outcomes: Any, is_counted: Array) -> Any:
-    def mean(field: Array) -> Array:
-        mask = is_counted.reshape(is_counted.shape + (1,) * (field.ndim - 1))
-        return jnp.mean(field.astype(jnp.float32), axis=0, where=mask)
-
-    return jax.tree.map(mean, outcomes)
 
 
 def _check_fit(task: Task, state: CrepsState) -> None:

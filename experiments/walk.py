@@ -29,7 +29,7 @@ from experiments.walking_policy import POLICY, START_UP, record, save_film
 BOUNDS = {"nao": NAO_BOUNDS, "paper": PAPER_BOUNDS}
 SAMPLERS = {"gaussian": partial(gaussian_contexts, clip=True), "uniform": uniform_contexts}
 FILMED_SPEEDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-TIMESTEP = 0.005
+TIMESTEP = 0.004
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +53,8 @@ class Settings:
         duration: length of an episode, s.
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
         sampler: how contexts are drawn in learning, a name in SAMPLERS.
+        margin: how far beyond both ends of the range contexts are drawn in learning, m/s: the ends are
+            learned as well as the middle only where there are samples on both sides.
         learning_noise: how many times larger the noise is in learning than in the evaluation: a policy
             that has learned to stay up in more of it falls less.
         eval_seeds: fresh episodes at each speed of the table.
@@ -74,6 +76,7 @@ class Settings:
     duration: float = 8.0
     heading_gain: float = 0.0
     sampler: str = "gaussian"
+    margin: float = 0.0
     learning_noise: float = 1.0
     eval_seeds: int = 10
 
@@ -87,7 +90,7 @@ class Settings:
 
 _OURS = Settings(archive_size=300, heading_gain=0.3, sampler="uniform", learning_noise=1.5, start_mean=-0.3)
 SETTINGS = {
-    "quick": dataclasses.replace(_OURS, iterations=50),
+    "quick": dataclasses.replace(_OURS, iterations=40, first_samples=30, margin=0.02, learning_noise=1.0),
     "paper": Settings(trials=5, bounds="paper"),
     "best": dataclasses.replace(_OURS, iterations=140, samples=40, archive_size=400, eval_seeds=50),
 }
@@ -155,7 +158,9 @@ def make_task(settings: Settings, *, noise: float = 1.0) -> Task:
     task = nao_walk(
         settings.low,
         settings.high,
-        sample_context=SAMPLERS[settings.sampler](settings.low, settings.high),
+        sample_context=SAMPLERS[settings.sampler](
+            settings.low - settings.margin, settings.high + settings.margin
+        ),
         duration=settings.duration,
         start_up=START_UP,
         noise=WalkNoise(*(noise * size for size in WalkNoise())),

@@ -22,7 +22,7 @@ def test_one_control_step_equals_c():
     # Enough iterations for both to converge: what is compared is the physics, not the rounding of the solver.
     model = load_nao()
     model.opt.iterations, model.opt.ls_iterations = 30, 30
-    control_step = jax.jit(jax.vmap(make_control_step(model, 4)))
+    control_step = jax.jit(jax.vmap(make_control_step(model, 5)))
     num = 8
     qpos = np.tile(model.key("stand").qpos, (num, 1))
     qpos[:, 2] += rng.uniform(0.0, 0.003, num)

@@ -1,0 +1,111 @@
+"""Roll out a batch of parameters for a task, shared out over devices, and see to failures."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from creps_jax.tasks.base import Task
+from creps_jax.typing import Array, Bool, Float, PRNGKey
+
+__all__ = ["Devices", "device_tuple", "mean_outcome", "replicate", "roll_out"]
+
+Devices = Sequence[jax.Device] | None
+"""Devices that share the rollouts; None stands for all local ones."""
+
+
+def device_tuple(devices: Devices) -> tuple[jax.Device, ...]:
+    """Return the devices in a form that can be compiled for; all local ones for None.
+
+    Raises:
+        ValueError: If there is no device.
+    """
+    devices = tuple(jax.local_devices() if devices is None else devices)
+    if not devices:
+        raise ValueError("devices must hold at least one device, got none")
+    return devices
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def roll_out(
+    task: Task,
+    devices: tuple[jax.Device, ...],
+    key: PRNGKey,
+    contexts: Float[Array, "n s"],
+    thetas: Float[Array, "n d"],
+) -> tuple[Any, Bool[Array, " n"]]:
+    """Roll out a batch over the devices.
+
+    Args:
+        task: What to roll out.
+        devices: Devices that share the rollouts.
+        key: Random key; that of a rollout follows from its number, whatever device it runs on.
+        contexts: Context of each rollout.
+        thetas: Parameters of each rollout.
+
+    Returns:
+        The task's outcomes (n, ...), where rewards that are not finite are replaced by the task's
+        worst, and which rollouts failed so.
+
+    Raises:
+        ValueError: If the task gives anything but one reward a rollout.
+    """
+    num = contexts.shape[0]
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
+    rollouts = jax.vmap(task.rollout)
+    if len(devices) > 1:
+        rollouts = _shared_out(rollouts, devices)
+    outcomes = rollouts(keys, contexts, thetas)
+    if outcomes.reward.shape != (num,):
+        raise ValueError(f"a rollout must give one reward, got shape {outcomes.reward.shape[1:]}")
+    is_failed = ~jnp.isfinite(outcomes.reward)
+    reward = jnp.where(is_failed, jnp.float32(task.worst_reward), outcomes.reward.astype(jnp.float32))
+    return outcomes._replace(reward=reward), is_failed
+
+
+def replicate(tree: Any, devices: tuple[jax.Device, ...]) -> Any:
+    """Put arrays on all devices, where `roll_out` leaves its results.
+
+    A state that an iteration finds elsewhere than it leaves it would have the next one compiled anew.
+    """
+    if len(devices) == 1:
+        return tree
+    return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec()))
+
+
+def mean_outcome(outcomes: Any, is_counted: Bool[Array, " n"]) -> Any:
+    """Average each field (n, ...) of outcomes over the rollouts that count; NaN if none does."""
+
+    def mean(field: Array) -> Array:
+        mask = is_counted.reshape(is_counted.shape + (1,) * (field.ndim - 1))
+        return jnp.mean(field.astype(jnp.float32), axis=0, where=mask)
+
+    return jax.tree.map(mean, outcomes)
+
+
+def _mesh(devices: tuple[jax.Device, ...]) -> Mesh:
+    return Mesh(np.asarray(devices), ("rollouts",))
+
+
+def _shared_out(function: Callable, devices: tuple[jax.Device, ...]) -> Callable:
+    """Share the rows of a batch out over devices; the last row fills up what does not divide."""
+    mesh = _mesh(devices)
+    rows = PartitionSpec("rollouts")
+    # Unchecked, so that a rollout may start its loops from constants, as it may on one device.
+    sharded = jax.shard_map(function, mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False)
+
+    def shared_out(*batch: Array) -> Any:
+        num = batch[0].shape[0]
+        padded = -(-num // len(devices)) * len(devices)
+        index = jnp.minimum(jnp.arange(padded), num - 1)
+        results = sharded(*(x[index] for x in batch))
+        # Every device goes on with all results: the update is small, and equal on each of them.
+        results = lax.with_sharding_constraint(results, NamedSharding(mesh, PartitionSpec()))
+        return jax.tree.map(lambda x: x[:num], results)
+
+    return shared_out
