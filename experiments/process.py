@@ -21,7 +21,7 @@ def usable_cores() -> int:
 def num_devices() -> int:
     """Return how many CPU devices to use: one a core, where several of them do not wait for each other forever.
 
-    With the jax that Python 3.11 gets (0.9), an update that runs on two devices has been seen to hang.
+    With the jax of Python 3.11 (0.9) an update that runs on two devices has been seen to hang.
     """
     return usable_cores() if sys.version_info >= (3, 12) else 1
 

@@ -24,8 +24,6 @@ import os
 import sys
 from pathlib import Path
 
-# One CPU device a core; has to be set before jax starts.
-os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(os.cpu_count()))
 ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
 sys.path.insert(0, str(ROOT))
 
