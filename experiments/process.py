@@ -19,7 +19,7 @@ def usable_cores() -> int:
 
 
 def num_devices() -> int:
-    """Return how many CPU devices to use: one a core, where several of them do not wait for each other forever.
+    """Return how many CPU devices to use: one a core, unless several may wait for each other forever.
 
     With the jax of Python 3.11 (0.9) an update that runs on two devices has been seen to hang.
     """
