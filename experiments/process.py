@@ -3,7 +3,6 @@
 import contextlib
 import io
 import os
-import sys
 from pathlib import Path
 
 # One thread a device, and the small matrix products of the physics without the set-up costs of a library
@@ -16,14 +15,6 @@ def usable_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def num_devices() -> int:
-    """Return how many CPU devices to use: one a core, unless several may wait for each other forever.
-
-    With the jax of Python 3.11 (0.9) an update that runs on two devices has been seen to hang.
-    """
-    return usable_cores() if sys.version_info >= (3, 12) else 1
 
 
 def cache_folder() -> Path:
@@ -42,7 +33,7 @@ def prepare() -> None:
     ours = [flag for flag in XLA_FLAGS if flag.partition("=")[0] not in flags]
     os.environ["XLA_FLAGS"] = " ".join([*flags.split(), *ours])
     if "xla_force_host_platform_device_count" not in flags:
-        os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(num_devices()))
+        os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(usable_cores()))
     # Nor may the small factorisations of an update spin threads of their own against the devices': on
     # busy cores that made one a hundred times slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

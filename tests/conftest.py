@@ -4,11 +4,10 @@ import contextlib
 import io
 import os
 
-from experiments.process import num_devices, prepare
+from experiments.process import prepare
 
-# Two CPU devices where they are to be had, so that sharding is exercised everywhere. Compiling what is
-# small is faster than its cache.
-os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(min(2, num_devices())))
+# Two CPU devices, so that sharding is exercised everywhere. Compiling what is small is faster than its cache.
+os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 prepare()
 

@@ -134,15 +134,14 @@ def test_another_key_is_another_run(key):
     assert not np.allclose(*runs)
 
 
-@pytest.mark.skipif(len(jax.devices()) < 2, reason="one device: with jax 0.9 two of them can hang")
 def test_the_numbers_do_not_depend_on_the_devices(key):
+    assert len(jax.devices()) == 2
     settings = {"first_samples": None, "on_iteration": ignore}
     assert_close(run(key, devices=jax.devices()[:1], **settings), run(key, **settings))
     states = [run(key, algorithm=QUICK, devices=d)[0] for d in (jax.devices()[:1], jax.devices()[::-1])]
     assert_close(*states)
 
 
-@pytest.mark.skipif(len(jax.devices()) < 2, reason="one device: with jax 0.9 two of them can hang")
 def test_rollouts_run_on_all_devices():
     placed = {}
 

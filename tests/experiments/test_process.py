@@ -29,7 +29,7 @@ def prepared(tmp_path, **environment):
 
 def test_a_device_for_each_core_one_thread_each_and_a_cache(tmp_path):
     found = prepared(tmp_path)
-    assert found["JAX_NUM_CPU_DEVICES"] == str(process.num_devices())
+    assert found["JAX_NUM_CPU_DEVICES"] == str(process.usable_cores())
     assert found["XLA_FLAGS"].split() == list(process.XLA_FLAGS)
     assert Path(found["JAX_COMPILATION_CACHE_DIR"]) == tmp_path / ".cache" / "creps_jax" / "jax"
     assert Path(found["JAX_COMPILATION_CACHE_DIR"]).is_dir()
