@@ -7,11 +7,15 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import lax
+from jax.scipy.linalg import cho_factor, cho_solve
 from mujoco import mjx
 
 from creps_jax.typing import Array, Float
 
 __all__ = ["ControlStep", "RobotState", "initial_state", "make_control_step"]
+
+_POSITION_STAGES = (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.collision, mjx.make_constraint)
+_VELOCITY_STAGES = (mjx.com_vel, mjx.passive, mjx.rne)
 
 
 class RobotState(NamedTuple):
@@ -28,8 +32,19 @@ class RobotState(NamedTuple):
     qacc_warmstart: Float[Array, " nv"]
 
 
-ControlStep = Callable[[RobotState, Array, Array], RobotState]
-"""(state, set-points before, set-points after) -> state one control step later."""
+ControlStep = Callable[[RobotState, Array, Array, Array], RobotState]
+"""(state, set-points before, set-points after, their speeds) -> state one control step later."""
+
+
+class _Servos(NamedTuple):
+    """The position servos of a robot, each on a joint with one degree of freedom."""
+
+    stiffness: np.ndarray
+    damping: np.ndarray
+    control_range: np.ndarray
+    torque_range: np.ndarray
+    qpos_index: np.ndarray
+    qvel_index: np.ndarray
 
 
 def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:
@@ -41,43 +56,33 @@ def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:
 def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     """Return the function that steps the robot through one control step.
 
-    The set-points of the servos move at constant speed from the ones before to the ones after. Each servo
-    is told that speed too, so that its damping acts on the error of the speed and not on the motion
-    itself.
+    The set-points of the servos move evenly from the ones before to the ones after. Each servo is also told
+    a speed, rad/s, so that its damping acts on the error of the speed and not on the motion itself.
 
     Args:
-        model: A model all of whose actuators are position servos.
+        model: A model with the implicitfast integrator and the Newton solver, all of whose actuators are
+            position servos on joints. Forces from outside, tendons and sensors play no part.
         num_substeps: Physics steps in a control step.
 
     Returns:
         The control step, for one robot; vmap it for a batch.
 
     Raises:
-        ValueError: If an actuator is no position servo, or there is no substep.
+        ValueError: If an actuator is no plain position servo on a joint, integrator or solver is another,
+            or there is no substep.
     """
     if num_substeps < 1:
         raise ValueError(f"num_substeps must be at least 1, got {num_substeps}")
-    speed_lead = _speed_lead(model)
-    device_model = mjx.put_model(model)
-    # Only what the state holds goes round the loop; the rest of mjx.Data is made anew in each step and
-    # costs nothing.
-    blank = mjx.make_data(model)
-    control_period = num_substeps * model.opt.timestep
+    step = _make_step(model)
 
     def control_step(
-        state: RobotState, before: Float[Array, " nu"], after: Float[Array, " nu"]
+        state: RobotState,
+        before: Float[Array, " nu"],
+        after: Float[Array, " nu"],
+        speed: Float[Array, " nu"],
     ) -> RobotState:
-        lead = jnp.asarray(speed_lead, before.dtype) * (after - before) / control_period
-
         def substep(state, share):
-            data = blank.replace(
-                qpos=state.qpos,
-                qvel=state.qvel,
-                qacc_warmstart=state.qacc_warmstart,
-                ctrl=before + share * (after - before) + lead,
-            )
-            data = mjx.step(device_model, data)
-            return RobotState(data.qpos, data.qvel, data.qacc_warmstart), None
+            return step(state, before + share * (after - before), speed), None
 
         shares = jnp.arange(1, num_substeps + 1, dtype=before.dtype) / num_substeps
         return lax.scan(substep, state, shares)[0]
@@ -85,12 +90,86 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     return control_step
 
 
-def _speed_lead(model: mujoco.MjModel) -> np.ndarray:
-    """Return by how much, per speed, a set-point is to run ahead: damping over stiffness of the servo, s."""
+def _make_step(model: mujoco.MjModel) -> Callable[[RobotState, Array, Array], RobotState]:
+    """Return `mj_step` for (state, set-points, their speeds), put together from the stages of MJX.
+
+    `mjx.step` has stages that do nothing for a robot with plain servos and nothing else that acts on it, but
+    take time: Jacobians of all bodies for forces from outside, and matrices of moments for the actuators.
+    """
+    servos = _servos_of(model)
+    for name, found, expected in (
+        ("integrator", model.opt.integrator, mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+        ("solver", model.opt.solver, mujoco.mjtSolver.mjSOL_NEWTON),
+    ):
+        if found != expected:
+            raise ValueError(f"the {name} must be {expected.name}, got {type(expected)(found).name}")
+    device_model = mjx.put_model(model)
+    # Damping is made implicit here, as implicitfast does it; `mjx.euler` then only integrates.
+    explicit = model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    integrator = device_model.tree_replace({"opt.disableflags": explicit})
+    # Only what the state holds goes round a loop; the rest of mjx.Data is made anew in each step and
+    # costs nothing.
+    blank = mjx.make_data(model)
+    timestep = float(model.opt.timestep)
+
+    def step(state: RobotState, set_point: Array, speed: Array) -> RobotState:
+        data = blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
+        for stage in _POSITION_STAGES + _VELOCITY_STAGES:
+            data = stage(device_model, data)
+        torque, damping = _act(servos, data, set_point, speed)
+        inertia = mjx.full_m(device_model, data)
+        qfrc_smooth = data.qfrc_passive - data.qfrc_bias + torque
+        qacc_smooth = cho_solve(cho_factor(inertia, lower=True), qfrc_smooth)
+        data = data.replace(qfrc_smooth=qfrc_smooth, qacc_smooth=qacc_smooth)
+        data = mjx.solve(device_model, data)
+        # implicitfast: the velocity that damps is that of the end of the step.
+        damped = inertia + timestep * jnp.diag(damping + device_model.dof_damping)
+        qacc = cho_solve(cho_factor(damped, lower=True), qfrc_smooth + data.qfrc_constraint)
+        moved = mjx.euler(integrator, data.replace(qacc=qacc))
+        return RobotState(moved.qpos, moved.qvel, data.qacc)
+
+    return step
+
+
+def _act(servos: _Servos, data: mjx.Data, set_point: Array, speed: Array) -> tuple[Array, Array]:
+    """Return torques and damping coefficients of the servos, one for each degree of freedom."""
+    # That far ahead, a servo's damping against the speed of the set-point costs it nothing.
+    control = jnp.clip(set_point + servos.damping / servos.stiffness * speed, *servos.control_range)
+    wanted = servos.stiffness * (control - data.qpos[servos.qpos_index])
+    wanted = wanted - servos.damping * data.qvel[servos.qvel_index]
+    torque = jnp.clip(wanted, *servos.torque_range)
+    # At its limit a torque no longer depends on the velocity.
+    damping = jnp.where(torque == wanted, servos.damping, 0.0)
+    zeros = jnp.zeros_like(data.qvel)
+    return zeros.at[servos.qvel_index].add(torque), zeros.at[servos.qvel_index].add(damping)
+
+
+def _servos_of(model: mujoco.MjModel) -> _Servos:
+    """Read the servos out of a model; refuse other actuators."""
     stiffness, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
-    is_servo = (model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE) & (stiffness > 0)
-    is_servo &= model.actuator_biasprm[:, 1] == -stiffness
+    is_servo = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    joint = np.where(is_servo, model.actuator_trnid[:, 0], 0)
+    is_servo &= (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED) & (stiffness > 0)
+    is_servo &= model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    is_servo &= (model.actuator_biasprm[:, 0] == 0) & (model.actuator_biasprm[:, 1] == -stiffness)
+    is_servo &= model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
+    is_servo &= (model.actuator_gear[:, 0] == 1) & (model.jnt_actfrclimited[joint] == 0)
+    is_servo &= np.isin(model.jnt_type[joint], [mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE])
     if not is_servo.all():
         names = [model.actuator(i).name for i in np.flatnonzero(~is_servo)]
-        raise ValueError(f"every actuator must be a position servo, these are not: {names}")
-    return damping / stiffness
+        raise ValueError(f"every actuator must be a position servo on a joint, these are not: {names}")
+    control_range = _range(model.actuator_ctrllimited, model.actuator_ctrlrange)
+    torque_range = _range(model.actuator_forcelimited, model.actuator_forcerange)
+    return _Servos(
+        stiffness.astype(np.float32),
+        damping.astype(np.float32),
+        control_range.astype(np.float32),
+        torque_range.astype(np.float32),
+        qpos_index=model.jnt_qposadr[joint],
+        qvel_index=model.jnt_dofadr[joint],
+    )
+
+
+def _range(is_limited: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Return the lowest and the highest value of each actuator (2, nu), infinite where it has no limits."""
+    return np.where(is_limited.astype(bool), limits.T, [[-np.inf], [np.inf]])

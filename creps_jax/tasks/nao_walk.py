@@ -14,7 +14,7 @@ from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, MAX_JOINT_SPEED
 from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints
 from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, params_from_theta
 from creps_jax.physics.mjx import RobotState, initial_state, make_control_step
-from creps_jax.rotations import matrix_to_rpy, quat_to_matrix, rotation_y, rpy_to_quat
+from creps_jax.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
 from creps_jax.tasks.base import Task
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
 
@@ -37,7 +37,10 @@ class WalkReward(NamedTuple):
 
 
 class WalkNoise(NamedTuple):
-    """Standard deviations of the noise on measured angles, set-points and joints at the start, rad."""
+    """Standard deviations of the noise on measured angles, set-points and joints at the start, rad.
+
+    Noise is white: new in every control step.
+    """
 
     lean: float = 0.01
     set_point: float = 0.01
@@ -68,7 +71,7 @@ class WalkRecord(NamedTuple):
     Attributes:
         time: Time, s.
         qpos: Generalised positions of the robot, m and rad.
-        set_point: Set-points of the servos, rad.
+        set_point: Planned set-points of the servos, without the noise, rad.
         pose: Planned pose of hips and feet.
         has_fallen: Whether the robot has fallen by then.
     """
@@ -160,6 +163,8 @@ def nao_walk(
 
     Source: Abdolmaleki et al. 2016, Section 4.3.
     """
+    if not low < high:
+        raise ValueError(f"low must be below high, got {low} and {high}")
     if not 0 <= start_up < duration:
         raise ValueError(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
@@ -257,17 +262,19 @@ def _make_walker(model, duration, noise, heading_gain):
         set_point_noise = noise.set_point * jax.random.normal(
             set_point_key, (num_ticks, NUM_JOINTS), theta.dtype
         )
+        set_point_noise = jnp.concatenate([jnp.zeros((1, NUM_JOINTS), theta.dtype), set_point_noise])
         return _Walk(robot, set_point, params, poses, lean_noise, set_point_noise)
 
     def advance(walk: _Walk, tick: Array, robot: RobotState, set_point: Array) -> tuple[RobotState, Array]:
-        pose, lean_noise, set_point_noise = jax.tree.map(
-            lambda leaf: leaf[tick], (walk.poses, walk.lean_noise, walk.set_point_noise)
-        )
-        measured = matrix_to_rpy(quat_to_matrix(robot.qpos[3:7])) + lean_noise
-        target = pose_joints(walk.params, pose, measured, heading_gain=heading_gain) + set_point_noise
+        pose, lean_noise = jax.tree.map(lambda leaf: leaf[tick], (walk.poses, walk.lean_noise))
+        measured = quat_to_rpy(robot.qpos[3:7]) + lean_noise
+        target = pose_joints(walk.params, pose, measured, heading_gain=heading_gain)
         slew = MAX_JOINT_SPEED * CONTROL_PERIOD
         target = set_point + jnp.clip(target - set_point, -slew, slew)
-        return control_step(robot, set_point, target), target
+        # The servos miss their set-points by the noise; the speed that they are told is the planned one.
+        before = set_point + walk.set_point_noise[tick]
+        after = target + walk.set_point_noise[tick + 1]
+        return control_step(robot, before, after, (target - set_point) / CONTROL_PERIOD), target
 
     return begin, advance
 

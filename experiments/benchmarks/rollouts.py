@@ -77,7 +77,9 @@ def _bare_c(model: mujoco.MjModel, threads: int) -> Callable[[], None]:
     substeps = round(CONTROL_PERIOD / model.opt.timestep)
     shares = np.arange(1, substeps + 1)[:, None] / substeps
     before = np.concatenate([walk.set_point[:1], walk.set_point[:-1]])[:, None]
-    control = (before + shares * (walk.set_point[:, None] - before)).reshape(-1, model.nu)
+    change = walk.set_point[:, None] - before
+    lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] / CONTROL_PERIOD
+    control = (before + (shares + lead) * change).reshape(-1, model.nu)
 
     def run() -> None:
         states, controls = np.tile(state, (BATCH, 1)), np.tile(control, (BATCH, 1, 1))

@@ -18,10 +18,10 @@ def _targets(theta, time, measured):
     return joint_targets(params, plan_walk(params, NUM_STEPS), time, measured, heading_gain=0.3)
 
 
-def servo_step(model, data, before, after):
-    """Move the set-points at constant speed through one control step, and tell the servos that speed."""
+def servo_step(model, data, before, after, speed):
+    """Move the set-points evenly through one control step, and tell the servos a speed."""
     substeps = round(CONTROL_PERIOD / model.opt.timestep)
-    lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] * (after - before) / CONTROL_PERIOD
+    lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] * speed
     for k in range(1, substeps + 1):
         data.ctrl[:] = before + k / substeps * (after - before) + lead
         mujoco.mj_step(model, data)
@@ -46,15 +46,17 @@ def walk(model, qpos, theta, *, duration, noise, seed):
     data.qpos[:] = qpos
     data.qpos[7:] += noise * rng.standard_normal(model.nu)
     set_point, start_x = np.array(qpos[7:], float), 0.0
+    miss = np.zeros(model.nu)
     for tick in range(round(duration / CONTROL_PERIOD)):
         measured = lean_of(data.qpos[3:7]) + noise * rng.standard_normal(3)
         time = np.float32((tick + 1) * CONTROL_PERIOD)
         target = np.asarray(_targets(theta, time, measured.astype(np.float32)), float)
-        target = target + noise * rng.standard_normal(model.nu)
         slew = MAX_JOINT_SPEED * CONTROL_PERIOD
         target = set_point + np.clip(target - set_point, -slew, slew)
-        servo_step(model, data, set_point, target)
-        set_point = target
+        next_miss = noise * rng.standard_normal(model.nu)
+        speed = (target - set_point) / CONTROL_PERIOD
+        servo_step(model, data, set_point + miss, target + next_miss, speed)
+        set_point, miss = target, next_miss
         if tick == round(2.0 / CONTROL_PERIOD) - 1:
             start_x = data.qpos[0]
         if data.qpos[2] < 0.2:

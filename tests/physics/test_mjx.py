@@ -17,7 +17,8 @@ def model():
 
 
 @pytest.mark.usefixtures("relaxed_promotion")
-def test_one_control_step_equals_c():
+@pytest.mark.parametrize(("change", "saturates"), [(0.02, False), (0.12, True)])
+def test_one_control_step_equals_c(change, saturates):
     rng = np.random.default_rng(0)
     # Enough iterations for both to converge: what is compared is the physics, not the rounding of the solver.
     model = load_nao()
@@ -28,16 +29,20 @@ def test_one_control_step_equals_c():
     qpos[:, 2] += rng.uniform(0.0, 0.003, num)
     qpos[:, 7:] += 0.02 * rng.standard_normal((num, model.nu))
     before = qpos[:, 7:].copy()
-    # No torque reaches its limit: there C leaves the servo out of the implicit step, and MJX does not.
-    after = before + 0.02 * rng.standard_normal(before.shape)
+    after = before + change * rng.standard_normal(before.shape)
+    speed = (after - before) / 0.02
     states = jax.vmap(lambda q: initial_state(q, model.nv))(jnp.asarray(qpos, jnp.float32))
-    ours = control_step(states, jnp.asarray(before, jnp.float32), jnp.asarray(after, jnp.float32))
+    ours = control_step(states, *(jnp.asarray(x, jnp.float32) for x in (before, after, speed)))
+    saturated = 0
     for i in range(num):
         data = mujoco.MjData(model)
         data.qpos[:] = qpos[i]
-        servo_step(model, data, before[i], after[i])
+        servo_step(model, data, before[i], after[i], speed[i])
         np.testing.assert_allclose(ours.qpos[i], data.qpos, atol=2e-6)
         np.testing.assert_allclose(ours.qvel[i], data.qvel, atol=2e-4)
+        saturated += np.sum(np.abs(data.actuator_force) >= model.actuator_forcerange[:, 1])
+    # A torque at its limit is left out of the implicit step.
+    assert (saturated > 0) == saturates
 
 
 def test_no_substep_is_an_error(model):
@@ -45,10 +50,31 @@ def test_no_substep_is_an_error(model):
         make_control_step(model, 0)
 
 
-def test_a_motor_that_is_no_servo_is_an_error():
-    spec = mujoco.MjSpec.from_string(
-        """<mujoco><worldbody><body><joint name="hinge"/><geom size=".1"/></body></worldbody>
-        <actuator><motor name="bare" joint="hinge"/></actuator></mujoco>"""
-    )
-    with pytest.raises(ValueError, match="bare"):
-        make_control_step(spec.compile(), 4)
+HINGE = """<mujoco><option integrator="implicitfast" {option}/><worldbody><body><joint name="hinge"/>
+<geom size=".1"/><site name="site"/></body></worldbody><actuator>{actuator}</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "actuator",
+    [
+        '<motor name="bad" joint="hinge"/>',
+        '<position name="bad" site="site"/>',
+        '<position name="bad" joint="hinge" timeconst=".1"/>',
+        '<position name="bad" joint="hinge" gear="2"/>',
+    ],
+)
+def test_an_actuator_that_is_no_plain_servo_is_an_error(actuator):
+    with pytest.raises(ValueError, match="bad"):
+        make_control_step(mujoco.MjModel.from_xml_string(HINGE.format(option="", actuator=actuator)), 4)
+
+
+@pytest.mark.parametrize(
+    ("option", "match"),
+    [('solver="CG"', "solver must be mjSOL_NEWTON, got mjSOL_CG"), ('integrator="Euler"', "got mjINT_EULER")],
+)
+def test_another_solver_or_integrator_is_an_error(option, match):
+    xml = HINGE.format(option=option, actuator='<position name="a" joint="hinge"/>')
+    if "integrator" in option:
+        xml = xml.replace('integrator="implicitfast" ', "")
+    with pytest.raises(ValueError, match=match):
+        make_control_step(mujoco.MjModel.from_xml_string(xml), 4)

@@ -107,6 +107,23 @@ def test_the_solver_is_converged_on_walking_gaits(outcome):
     )
 
 
+@pytest.mark.slow
+def test_the_solver_falls_as_often_as_a_converged_one():
+    """In more noise than learning has, where enough walks end in a fall to tell."""
+    model = load_nao()
+    model.opt.iterations, model.opt.ls_iterations = 30, 30
+    noise = WalkNoise(0.018, 0.018, 0.018)
+    ours, reference = (
+        rolled_out(nao_walk(heading_gain=GAIN, noise=noise, model=m), [MIDDLE, FAST], 96)
+        for m in (None, model)
+    )
+    difference = np.abs(ours.fell.mean(axis=1) - reference.fell.mean(axis=1))
+    # Two standard deviations of the difference between two shares of a tenth.
+    assert (difference <= 0.09).all()
+    speeds = [np.nanmean(np.where(o.fell, np.nan, o.speed[..., 0]), axis=1) for o in (ours, reference)]
+    np.testing.assert_allclose(*speeds, atol=0.01)
+
+
 def test_weights_of_the_reward_are_arguments():
     task = nao_walk(duration=0.1, start_up=0.0, reward=WalkReward(speed=1.0, drift=0.0, fall=7.0))
     assert task.worst_reward == -(7.0 + (3.0 * 0.6) ** 2)
