@@ -95,22 +95,10 @@ def rpy_to_quat(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
     ])  # fmt: skip
 
 
-def remove_yaw(rotation: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the lean of a body without its heading: ``Rz(-yaw) @ R = Ry(pitch) @ Rx(roll)``."""
-    yaw = matrix_to_rpy(rotation)[2]
-    return rotation_z(-yaw) @ rotation
-
-
 def rigid_transform(rotation: Float[Array, "3 3"], position: Float[Array, "3"]) -> Float[Array, "4 4"]:
     """Return the (4, 4) transform with this rotation and translation."""
     bottom = jnp.zeros((1, 4), rotation.dtype).at[0, 3].set(1.0)
     return jnp.concatenate([jnp.concatenate([rotation, position[:, None]], axis=1), bottom])
-
-
-def rigid_inverse(transform: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
-    """Return the inverse of a rigid transform: ``T_b_a`` from ``T_a_b``."""
-    transposed = transform[:3, :3].T
-    return rigid_transform(transposed, -transposed @ transform[:3, 3])
 
 
 def _rotation_entries(angle: ScalarLike) -> tuple[Float[Array, ""], ...]:

@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[1]
 ARRAYS = "arrays.npz"
 MANIFEST = "manifest.json"
 
-_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax", "scipy", "matplotlib")
+_PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "matplotlib")
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:

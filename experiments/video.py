@@ -93,7 +93,7 @@ def _job(model: Path, clips: Sequence[Clip], still_at: float) -> dict[str, objec
 def _explain(code: int, output: str) -> str:
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     last = lines[-1] if lines else f"the renderer ended with code {code}"
-    if "No space left" in last:
+    if "imageio_ffmpeg" in last or "No space left" in last:
         return f"no video: {last}"
     return f"no video: OpenGL is not to be had ({last}); on Debian or Ubuntu: {_LIBRARIES_HINT}"
 

@@ -118,16 +118,6 @@ def leg_indices(side: float | int) -> slice:
     return slice(start, start + len(_LEG))
 
 
-def arm_indices(side: float | int) -> slice:
-    """Return where an arm's four joints lie in a joint vector (or in `JOINT_NAMES`), for `LEFT` or `RIGHT`.
-
-    Raises:
-        ValueError: `side` is neither `LEFT` nor `RIGHT`.
-    """
-    start = len(_HEAD) + _side_index(side) * len(_ARM)
-    return slice(start, start + len(_ARM))
-
-
 def _side_index(side: float | int) -> int:
     """Return 0 for the left and 1 for the right side."""
     if side not in (LEFT, RIGHT):

@@ -13,7 +13,6 @@ from creps_jax.motion.nao_geometry import (
     JOINT_UPPER,
     LEFT,
     RIGHT,
-    arm_indices,
     leg_indices,
 )
 from creps_jax.motion.nao_kinematics import MAX_REACH, MIN_REACH, leg_fk, leg_ik
@@ -196,7 +195,7 @@ def test_indices_select_the_joints_of_a_side():
         name.split("_", 1)[1] for name in JOINT_NAMES[leg_indices(RIGHT)]
     ]
     for side, word in ((LEFT, "left_"), (RIGHT, "right_")):
-        names = JOINT_NAMES[arm_indices(side)] + JOINT_NAMES[leg_indices(side)]
-        assert len(names) == 10 and all(name.startswith(word) for name in names)
+        names = JOINT_NAMES[leg_indices(side)]
+        assert len(names) == 6 and all(name.startswith(word) for name in names)
     with pytest.raises(ValueError, match=r"side must be LEFT .* got 0"):
         leg_indices(0)

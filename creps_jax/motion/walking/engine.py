@@ -18,10 +18,19 @@ from creps_jax.motion.walking.zmp import zmp_reference
 from creps_jax.rotations import rigid_transform, rotation_x, rotation_y, rotation_z
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["BodyPose", "StepPlan", "body_pose", "joint_targets", "plan_step", "plan_walk", "pose_joints"]
+__all__ = [
+    "BodyPose",
+    "StepPlan",
+    "body_pose",
+    "joint_targets",
+    "plan_step",
+    "plan_walk",
+    "pose_at",
+    "pose_joints",
+]
 
 NUM_NODES = 33
-# Height of the CoM above the middle of the hips, and of the ankle above the floor, m.
+# Height of the CoM above the middle of the hips, m.
 _COM_ABOVE_HIP = 0.025
 # The foot's "centre", where the ZMP is to be, lies ahead of the ankle by this much, m; the CoM is planned
 # above it.
