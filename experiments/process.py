@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 # One thread a device, and the small matrix products of the physics without the set-up costs of a library
-# for large ones.
+# for large ones. XLA ends the process on a flag it does not know: jaxlib 0.9.0 and 0.12.0 know both.
 XLA_FLAGS = ("--xla_cpu_multi_thread_eigen=false", "--xla_cpu_experimental_ynn_fusion_type=")
 
 

@@ -5,6 +5,7 @@ import inspect
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from scipy.optimize import minimize as scipy_minimize
 
@@ -40,6 +41,29 @@ def test_flat_directions_are_left_alone():
     np.testing.assert_allclose(direction @ found.point, 5.0, atol=1e-5)
     # Nothing along the flat plane: each variable, in units of its own curvature, moves by the same.
     np.testing.assert_allclose((found.point - start) * direction, (5.0 - direction @ start) / 3, atol=1e-3)
+
+
+def test_a_dual_like_function_agrees_with_optax():
+    """In log temperature and offset, as the dual is solved, where it is not convex everywhere."""
+    rewards = jnp.asarray(np.random.default_rng(1).normal(size=200), jnp.float32)
+
+    def function(x):
+        temperature = jnp.exp(x[0])
+        return temperature * (0.5 + jax.nn.logsumexp((rewards - x[1]) / temperature) - jnp.log(200.0)) + x[1]
+
+    optimiser = optax.lbfgs()
+
+    def step(_, carry):
+        point, state = carry
+        value, grad = optax.value_and_grad_from_state(function)(point, state=state)
+        updates, state = optimiser.update(grad, state, point, value=value, grad=grad, value_fn=function)
+        return optax.apply_updates(point, updates), state
+
+    start = jnp.array([1.0, 0.5])
+    expected, _ = jax.jit(lambda x: jax.lax.fori_loop(0, 50, step, (x, optimiser.init(x))))(start)
+    found = minimise(function, start)
+    assert float(found.value) == pytest.approx(float(function(expected)), abs=1e-5)
+    assert float(found.point[0]) == pytest.approx(float(expected[0]), abs=1e-2)
 
 
 def test_log_sum_exp_agrees_with_scipy():
