@@ -34,7 +34,7 @@ TIMESTEP = 0.004
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Settings of the experiment; the defaults are the paper's protocol.
+    """Settings of the experiment; the preset `paper` is the paper's protocol, as far as DEVIATIONS.md goes.
 
     Attributes:
         iterations: iterations of learning.
@@ -57,6 +57,9 @@ class Settings:
             learned as well as the middle only where there are samples on both sides.
         learning_noise: how many times larger the noise is in learning than in the evaluation: a policy
             that has learned to stay up in more of it falls less.
+        hard_iterations: iterations at the end, with a new archive, in still more noise: a policy that is
+            nearly good there gives up its last falls without giving up its speed.
+        hard_noise: how many times larger the noise is in those.
         eval_seeds: fresh episodes at each speed of the table.
     """
 
@@ -78,21 +81,28 @@ class Settings:
     sampler: str = "gaussian"
     margin: float = 0.0
     learning_noise: float = 1.0
+    hard_iterations: int = 0
+    hard_noise: float = 2.0
     eval_seeds: int = 10
 
     def __post_init__(self) -> None:
         # Settings that come back from a manifest are plain.
         if isinstance(self.features, Mapping):
             object.__setattr__(self, "features", Features(**self.features))
-        if self.bounds not in BOUNDS:
-            raise UserError(f"bounds must be one of {', '.join(BOUNDS)}, got {self.bounds!r}")
+        for name, known in (("bounds", BOUNDS), ("sampler", SAMPLERS)):
+            if getattr(self, name) not in known:
+                raise UserError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 
 
-_OURS = Settings(archive_size=300, heading_gain=0.3, sampler="uniform", learning_noise=1.5, start_mean=-0.3)
+_OURS = Settings(
+    archive_size=300, heading_gain=0.3, sampler="uniform", margin=0.02, learning_noise=1.6, start_mean=-0.3
+)
 SETTINGS = {
-    "quick": dataclasses.replace(_OURS, iterations=40, first_samples=30, margin=0.02, learning_noise=1.0),
+    "quick": dataclasses.replace(_OURS, iterations=45, first_samples=30),
     "paper": Settings(trials=5, bounds="paper"),
-    "best": dataclasses.replace(_OURS, iterations=140, samples=40, archive_size=400, eval_seeds=50),
+    "best": dataclasses.replace(
+        _OURS, iterations=110, hard_iterations=30, samples=40, archive_size=400, eval_seeds=50
+    ),
 }
 
 
@@ -103,37 +113,45 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         Arrays of the learning (trials, iterations), the policies, their parameters over the speeds
         (trials, n, d) and the evaluation (trials, n, seeds).
     """
-    algorithm, start = make_algorithm(settings), first_policy(settings)
-    plan = Plan(
-        settings.iterations,
-        settings.samples,
-        settings.first_samples,
-        repeats=settings.repeats,
-        timestep=TIMESTEP,
+    algorithm, policy = make_algorithm(settings), first_policy(settings)
+    evaluate_key, *learn_keys = jax.random.split(key, 3)
+    phases = (
+        ("walk", settings.iterations, settings.learning_noise),
+        # Resumed with more iterations before it, it begins anew.
+        (f"walk-hard-{settings.iterations}", settings.hard_iterations, settings.hard_noise),
     )
-    learn_key, evaluate_key = jax.random.split(key)
-    states, log = learn(
-        trial_keys(learn_key, settings.trials),
-        average_repeats(make_task(settings, noise=settings.learning_noise), settings.repeats),
-        algorithm,
-        start,
-        plan,
-        session=session,
-        name="walk",
-    )
+    logs, episodes = [], [np.zeros(1, int)]
+    for (name, iterations, noise), learn_key in zip(phases, learn_keys, strict=True):
+        if iterations == 0:
+            continue
+        plan = Plan(
+            iterations, settings.samples, settings.first_samples, repeats=settings.repeats, timestep=TIMESTEP
+        )
+        states, log = learn(
+            trial_keys(learn_key, settings.trials),
+            average_repeats(make_task(settings, noise=noise), settings.repeats),
+            algorithm,
+            policy,
+            plan,
+            session=session,
+            name=name,
+        )
+        policy = states.policy
+        logs.append(log)
+        num_done = log["mean_reward"].shape[1]
+        episodes.append(episodes[-1][-1] + plan.episodes(np.arange(1, num_done + 1)))
+    log = {field: np.concatenate([log[field] for log in logs], axis=1) for field in logs[0]}
     speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
-    free = np.asarray(jax.vmap(algorithm.mean, (0, None))(states.policy, speeds[:, None]))
+    free = np.asarray(jax.vmap(algorithm.mean, (0, None))(policy, speeds[:, None]))
     outcome = evaluate_trials(evaluate_key, make_task(settings), speeds, free, repeats=settings.eval_seeds)
     fine = np.linspace(settings.low, settings.high, 51, dtype=np.float32)
     policies = [
-        saved_policy(settings, LinearGaussian(*pair))
-        for pair in zip(*map(np.asarray, states.policy), strict=True)
+        saved_policy(settings, LinearGaussian(*pair)) for pair in zip(*map(np.asarray, policy), strict=True)
     ]
-    num_done = log["mean_reward"].shape[1]
     return {
-        "episodes": plan.episodes(np.arange(1, num_done + 1)),
-        "coef": np.asarray(states.policy.coef),
-        "cov_chol": np.asarray(states.policy.cov_chol),
+        "episodes": np.concatenate(episodes[1:]),
+        "coef": np.asarray(policy.coef),
+        "cov_chol": np.asarray(policy.cov_chol),
         "fine_speeds": fine,
         "fine_theta": np.stack([[policy.theta(float(speed)) for speed in fine] for policy in policies]),
         "speeds": speeds,
@@ -152,9 +170,6 @@ def make_task(settings: Settings, *, noise: float = 1.0) -> Task:
         settings: settings of the experiment.
         noise: how many times the usual noise.
     """
-    for name, value, known in (("bounds", settings.bounds, BOUNDS), ("sampler", settings.sampler, SAMPLERS)):
-        if value not in known:
-            raise UserError(f"{name} must be one of {', '.join(known)}, got {value!r}")
     task = nao_walk(
         settings.low,
         settings.high,

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.tasks.base import Task
-from creps_jax.tasks.nao_walk import WalkOutcome
+from creps_jax.tasks.nao_walk import WalkOutcome, nao_walk
+from creps_jax.train import evaluate
 from experiments import results, runner, walk, walking_policy
 from experiments.cli import main
 from experiments.errors import UserError
-from experiments.policy_file import load_policy
+from experiments.policy_file import load_policy, policies_folder
 from experiments.video import Clip, VideoError
 
 
@@ -124,3 +126,14 @@ def test_settings_come_back_from_a_manifest():
 def test_unknown_bounds_are_refused():
     with pytest.raises(UserError, match="bounds must be one of nao, paper, got 'moon'"):
         walk.Settings(bounds="moon")
+
+
+@pytest.mark.usefixtures("relaxed_promotion")
+def test_the_shipped_policy_walks_at_the_asked_speed():
+    policy = load_policy(policies_folder() / "walk.npz")
+    speeds = jnp.array([[0.1], [0.35], [0.6]])
+    thetas = jnp.stack([jnp.asarray(policy.theta(float(speed))) for (speed,) in speeds])
+    task = nao_walk(duration=4.0, heading_gain=policy.task["heading_gain"])
+    outcome = evaluate(jax.random.key(0), task, speeds, thetas, repeats=6)
+    assert not outcome.fell.any()
+    np.testing.assert_allclose(outcome.speed[..., 0].mean(axis=1), speeds[:, 0], atol=0.05)
