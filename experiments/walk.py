@@ -101,7 +101,7 @@ SETTINGS = {
     "quick": dataclasses.replace(_OURS, iterations=45, first_samples=30),
     "paper": Settings(trials=5, bounds="paper"),
     "best": dataclasses.replace(
-        _OURS, iterations=110, hard_iterations=30, samples=40, archive_size=400, eval_seeds=50
+        _OURS, iterations=110, hard_iterations=60, samples=40, archive_size=400, eval_seeds=50
     ),
 }
 
