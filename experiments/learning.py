@@ -84,7 +84,7 @@ def learn(
         keys: (trials,) key of each trial.
         task: what to learn.
         algorithm: what learns it.
-        policy: the first policy of every trial, or one for each (trials, ...).
+        policy: the first policy of every trial.
         plan: iterations and samples.
         session: where to keep checkpoints and show progress.
         name: names the checkpoint, `checkpoint-NAME.npz`, and heads the progress.
@@ -98,9 +98,8 @@ def learn(
         KeyboardInterrupt: once the last whole iteration is saved.
         UserError: if the checkpoint is unreadable, of another run, or cannot be written.
     """
-    if policy.coef.ndim == 2:
-        policy = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(keys), *leaf.shape)), policy)
-    states = jax.vmap(algorithm.init)(policy)
+    first = algorithm.init(policy)
+    states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(keys), *leaf.shape)), first)
     path = None if session.folder is None else session.folder / f"checkpoint-{name}.npz"
     identity = {**session.identity, "part": name, "trials": len(keys)}
     latest = Checkpoint(states, {})

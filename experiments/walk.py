@@ -15,6 +15,7 @@ from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.creps import Creps, creps
 from creps_jax.features import quadratic_features
 from creps_jax.motion.walking.params import NAO_BOUNDS, PAPER_BOUNDS, PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
+from creps_jax.motion.walking.posture import Balance
 from creps_jax.policy import LinearGaussian
 from creps_jax.tasks import Task, average_repeats, sigmoid_constrained
 from creps_jax.tasks.nao_walk import WalkNoise, nao_walk
@@ -52,14 +53,13 @@ class Settings:
         high: highest speed, m/s.
         duration: length of an episode, s.
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
+        placement_gain: how far a landing foot is put out to where the robot tips over, see `Balance`; 0 is
+            the paper's engine.
         sampler: how contexts are drawn in learning, a name in SAMPLERS.
         margin: how far beyond both ends of the range contexts are drawn in learning, m/s: the ends are
             learned as well as the middle only where there are samples on both sides.
         learning_noise: how many times larger the noise is in learning than in the evaluation: a policy
             that has learned to stay up in more of it falls less.
-        hard_iterations: iterations at the end, with a new archive, in still more noise: a policy that is
-            nearly good there gives up its last falls without giving up its speed.
-        hard_noise: how many times larger the noise is in those.
         eval_seeds: fresh episodes at each speed of the table.
     """
 
@@ -78,11 +78,10 @@ class Settings:
     high: float = 0.6
     duration: float = 8.0
     heading_gain: float = 0.0
+    placement_gain: float = 0.0
     sampler: str = "gaussian"
     margin: float = 0.0
     learning_noise: float = 1.0
-    hard_iterations: int = 0
-    hard_noise: float = 2.0
     eval_seeds: int = 10
 
     def __post_init__(self) -> None:
@@ -93,16 +92,24 @@ class Settings:
             if getattr(self, name) not in known:
                 raise UserError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 
+    def balance(self) -> Balance:
+        """Return how steps answer to the measured orientation."""
+        return Balance(self.heading_gain, self.placement_gain)
+
 
 _OURS = Settings(
-    archive_size=300, heading_gain=0.3, sampler="uniform", margin=0.02, learning_noise=1.6, start_mean=-0.3
+    archive_size=300,
+    heading_gain=0.3,
+    placement_gain=0.6,
+    sampler="uniform",
+    margin=0.02,
+    learning_noise=1.6,
+    start_mean=-0.3,
 )
 SETTINGS = {
-    "quick": dataclasses.replace(_OURS, iterations=45, first_samples=30),
+    "quick": dataclasses.replace(_OURS, iterations=85, first_samples=30, learning_noise=1.4),
     "paper": Settings(trials=5, bounds="paper"),
-    "best": dataclasses.replace(
-        _OURS, iterations=110, hard_iterations=60, samples=40, archive_size=400, eval_seeds=50
-    ),
+    "best": dataclasses.replace(_OURS, iterations=120, samples=40, archive_size=400, eval_seeds=50),
 }
 
 
@@ -113,34 +120,25 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         Arrays of the learning (trials, iterations), the policies, their parameters over the speeds
         (trials, n, d) and the evaluation (trials, n, seeds).
     """
-    algorithm, policy = make_algorithm(settings), first_policy(settings)
-    evaluate_key, *learn_keys = jax.random.split(key, 3)
-    phases = (
-        ("walk", settings.iterations, settings.learning_noise),
-        # Resumed with more iterations before it, it begins anew.
-        (f"walk-hard-{settings.iterations}", settings.hard_iterations, settings.hard_noise),
+    algorithm = make_algorithm(settings)
+    plan = Plan(
+        settings.iterations,
+        settings.samples,
+        settings.first_samples,
+        repeats=settings.repeats,
+        timestep=TIMESTEP,
     )
-    logs, episodes = [], [np.zeros(1, int)]
-    for (name, iterations, noise), learn_key in zip(phases, learn_keys, strict=True):
-        if iterations == 0:
-            continue
-        plan = Plan(
-            iterations, settings.samples, settings.first_samples, repeats=settings.repeats, timestep=TIMESTEP
-        )
-        states, log = learn(
-            trial_keys(learn_key, settings.trials),
-            average_repeats(make_task(settings, noise=noise), settings.repeats),
-            algorithm,
-            policy,
-            plan,
-            session=session,
-            name=name,
-        )
-        policy = states.policy
-        logs.append(log)
-        num_done = log["mean_reward"].shape[1]
-        episodes.append(episodes[-1][-1] + plan.episodes(np.arange(1, num_done + 1)))
-    log = {field: np.concatenate([log[field] for log in logs], axis=1) for field in logs[0]}
+    evaluate_key, learn_key = jax.random.split(key)
+    states, log = learn(
+        trial_keys(learn_key, settings.trials),
+        average_repeats(make_task(settings, noise=settings.learning_noise), settings.repeats),
+        algorithm,
+        first_policy(settings),
+        plan,
+        session=session,
+        name="walk",
+    )
+    policy = states.policy
     speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
     free = np.asarray(jax.vmap(algorithm.mean, (0, None))(policy, speeds[:, None]))
     outcome = evaluate_trials(evaluate_key, make_task(settings), speeds, free, repeats=settings.eval_seeds)
@@ -149,7 +147,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         saved_policy(settings, LinearGaussian(*pair)) for pair in zip(*map(np.asarray, policy), strict=True)
     ]
     return {
-        "episodes": np.concatenate(episodes[1:]),
+        "episodes": plan.episodes(np.arange(1, log["mean_reward"].shape[1] + 1)),
         "coef": np.asarray(policy.coef),
         "cov_chol": np.asarray(policy.cov_chol),
         "fine_speeds": fine,
@@ -179,7 +177,7 @@ def make_task(settings: Settings, *, noise: float = 1.0) -> Task:
         duration=settings.duration,
         start_up=START_UP,
         noise=WalkNoise(*(noise * size for size in WalkNoise())),
-        heading_gain=settings.heading_gain,
+        balance=settings.balance(),
     )
     return sigmoid_constrained(task, *BOUNDS[settings.bounds])
 
@@ -226,7 +224,7 @@ def saved_policy(settings: Settings, policy: LinearGaussian) -> SavedPolicy:
         param_low=low,
         param_high=high,
         constraint="sigmoid",
-        task={"name": "walk", "heading_gain": settings.heading_gain},
+        task={"name": "walk", "balance": settings.balance()._asdict()},
     )
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from creps_jax.motion.walking.params import PARAM_NAMES
+from creps_jax.motion.walking.posture import Balance
 from creps_jax.tasks.nao_walk import CONTROL_PERIOD, record_walk
 from experiments import results
 from experiments.errors import UserError
@@ -67,10 +68,10 @@ def record(policy: SavedPolicy, speeds: Sequence[float], *, seed: int, duration:
         raise UserError("name at least one speed")
     thetas = jnp.stack([jnp.asarray(policy.theta(speed)) for speed in speeds])
     keys = jax.random.split(jax.random.key(seed), len(speeds))
-    gain = float(policy.task.get("heading_gain", 0.0))
-    walks = jax.jit(
-        jax.vmap(lambda key, theta: record_walk(key, theta, duration=duration, heading_gain=gain))
-    )(keys, thetas)
+    balance = balance_of(policy)
+    walks = jax.jit(jax.vmap(lambda key, theta: record_walk(key, theta, duration=duration, balance=balance)))(
+        keys, thetas
+    )
     qpos, fallen = np.asarray(walks.qpos), np.asarray(walks.has_fallen)
     clips = []
     for index, speed in enumerate(speeds):
@@ -116,3 +117,8 @@ def load_walking_policy(path: Path) -> SavedPolicy:
     if policy.param_names != PARAM_NAMES:
         raise UserError(f"{path} is no walking policy: its parameters are {', '.join(policy.param_names)}")
     return policy
+
+
+def balance_of(policy: SavedPolicy) -> Balance:
+    """Return how the steps of a policy answered to the measured orientation while it was learned."""
+    return Balance(**policy.task.get("balance", {}))

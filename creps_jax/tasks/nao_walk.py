@@ -13,6 +13,7 @@ from creps_jax.contexts import gaussian_contexts
 from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, MAX_JOINT_SPEED, NUM_JOINTS
 from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints
 from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, params_from_theta
+from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics.mjx import RobotState, initial_state, make_control_step
 from creps_jax.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
 from creps_jax.tasks.base import Task
@@ -134,7 +135,7 @@ def nao_walk(
     start_up: float = 2.0,
     reward: WalkReward = WalkReward(),
     noise: WalkNoise = WalkNoise(),
-    heading_gain: float = 0.0,
+    balance: Balance = Balance(),
     model: mujoco.MjModel | None = None,
 ) -> Task:
     """Make the walking task: the context is the asked speed in m/s, theta the ten walking parameters.
@@ -151,7 +152,7 @@ def nao_walk(
         start_up: Length of the time at its start over which the speed does not count, s.
         reward: Weights of the reward.
         noise: Sizes of the noise.
-        heading_gain: Share of the heading error that a step turns back; 0 is the paper's engine.
+        balance: How steps answer to the measured orientation; by default not at all, as in the paper.
         model: The robot; by default `load_nao()`.
 
     Returns:
@@ -170,7 +171,7 @@ def nao_walk(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
         )
     sample_context = gaussian_contexts(low, high, clip=True) if sample_context is None else sample_context
-    begin, advance = _make_walker(model, duration, noise, heading_gain)
+    begin, advance = _make_walker(model, duration, noise, balance)
     num_ticks = round(duration / CONTROL_PERIOD)
     start_up_ticks = round(start_up / CONTROL_PERIOD)
 
@@ -207,7 +208,7 @@ def record_walk(
     *,
     duration: float = 8.0,
     noise: WalkNoise = WalkNoise(),
-    heading_gain: float = 0.0,
+    balance: Balance = Balance(),
     model: mujoco.MjModel | None = None,
 ) -> WalkRecord:
     """Walk as `nao_walk` does and keep every control step, beyond a fall too.
@@ -217,13 +218,13 @@ def record_walk(
         theta: Walking parameters in the paper's order and units.
         duration: Length of the episode, s.
         noise: Sizes of the noise.
-        heading_gain: See `nao_walk`.
+        balance: See `nao_walk`.
         model: The robot; by default `load_nao()`.
 
     Returns:
         The walk.
     """
-    begin, advance = _make_walker(model, duration, noise, heading_gain)
+    begin, advance = _make_walker(model, duration, noise, balance)
     walk = begin(key, theta)
 
     def step(carry, tick):
@@ -239,7 +240,7 @@ def record_walk(
     )
 
 
-def _make_walker(model, duration, noise, heading_gain):
+def _make_walker(model, duration, noise, balance):
     """Return `begin(key, theta)` and `advance(walk, tick, robot, set_point)`, for rollout and record."""
     model = load_nao() if model is None else model
     _check_model(model)
@@ -268,7 +269,7 @@ def _make_walker(model, duration, noise, heading_gain):
     def advance(walk: _Walk, tick: Array, robot: RobotState, set_point: Array) -> tuple[RobotState, Array]:
         pose, lean_noise = jax.tree.map(lambda leaf: leaf[tick], (walk.poses, walk.lean_noise))
         measured = quat_to_rpy(robot.qpos[3:7]) + lean_noise
-        target = pose_joints(walk.params, pose, measured, heading_gain=heading_gain)
+        target = pose_joints(walk.params, pose, measured, balance=balance)
         slew = MAX_JOINT_SPEED * CONTROL_PERIOD
         target = set_point + jnp.clip(target - set_point, -slew, slew)
         # The servos miss their set-points by the noise; the speed that they are told is the planned one.

@@ -20,7 +20,7 @@ from creps_jax.train import evaluate  # noqa: E402
 from experiments import tables  # noqa: E402
 from experiments.errors import UserError  # noqa: E402
 from experiments.policy_file import policies_folder  # noqa: E402
-from experiments.walking_policy import load_walking_policy  # noqa: E402
+from experiments.walking_policy import balance_of, load_walking_policy  # noqa: E402
 
 SEEDS = 50
 
@@ -30,7 +30,7 @@ def main(path: Path) -> None:
     policy = load_walking_policy(path)
     speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
     thetas = jnp.stack([jnp.asarray(policy.theta(float(speed))) for speed in speeds])
-    task = nao_walk(heading_gain=float(policy.task.get("heading_gain", 0.0)))
+    task = nao_walk(balance=balance_of(policy))
     outcome = evaluate(jax.random.key(2026), task, jnp.asarray(speeds)[:, None], thetas, repeats=SEEDS)
     reward, speed, fell = (np.asarray(field) for field in (outcome.reward, outcome.speed, outcome.fell))
     print(tables.to_markdown(tables.speed_table(speeds, reward, speed, fell)))

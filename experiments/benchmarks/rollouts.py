@@ -20,6 +20,7 @@ import mujoco  # noqa: E402
 import mujoco.rollout  # noqa: E402
 import numpy as np  # noqa: E402
 
+from creps_jax.motion.walking.posture import Balance  # noqa: E402
 from creps_jax.tasks.nao_walk import CONTROL_PERIOD, load_nao, nao_walk, record_walk  # noqa: E402
 from creps_jax.train import evaluate  # noqa: E402
 
@@ -28,6 +29,7 @@ DURATION = 2.0
 ROUNDS = 5
 # A gait of about .33 m/s.
 THETA = (0.001, 0.176, 0.039, 0.224, 3.2, 0.46, 0.31, 0.074, 0.038, 0.11)
+BALANCE = Balance(heading_gain=0.3, placement_gain=0.6)
 
 
 def main() -> None:
@@ -57,7 +59,7 @@ def main() -> None:
 
 
 def _ours(devices: list[jax.Device]) -> Callable[[], None]:
-    task = nao_walk(duration=DURATION, start_up=0.5, heading_gain=0.3)
+    task = nao_walk(duration=DURATION, start_up=0.5, balance=BALANCE)
     contexts, thetas = jnp.full((BATCH, 1), 0.3), jnp.tile(jnp.array(THETA), (BATCH, 1))
 
     def run() -> None:
@@ -67,7 +69,7 @@ def _ours(devices: list[jax.Device]) -> Callable[[], None]:
 
 
 def _bare_c(model: mujoco.MjModel, threads: int) -> Callable[[], None]:
-    record = jax.jit(lambda key: record_walk(key, jnp.array(THETA), duration=DURATION, heading_gain=0.3))
+    record = jax.jit(lambda key: record_walk(key, jnp.array(THETA), duration=DURATION, balance=BALANCE))
     walk = jax.tree.map(np.asarray, record(jax.random.key(0)))
     data = [mujoco.MjData(model) for _ in range(threads)]
     data[0].qpos[:] = walk.qpos[0]

@@ -23,7 +23,7 @@ def make_policy(**changes) -> SavedPolicy:
         param_low=(0.0, -1.0),
         param_high=(2.0, 1.0),
         constraint="sigmoid",
-        task={"name": "walk", "heading_gain": 0.5},
+        task={"name": "walk", "balance": {"heading_gain": 0.5}},
     )
     return dataclasses.replace(policy, **changes)
 

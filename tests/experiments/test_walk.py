@@ -20,6 +20,7 @@ from experiments.cli import main
 from experiments.errors import UserError
 from experiments.policy_file import load_policy, policies_folder
 from experiments.video import Clip, VideoError
+from experiments.walking_policy import balance_of
 
 
 def stand_in(settings, **_) -> Task:
@@ -133,7 +134,7 @@ def test_the_shipped_policy_walks_at_the_asked_speed():
     policy = load_policy(policies_folder() / "walk.npz")
     speeds = jnp.array([[0.1], [0.35], [0.6]])
     thetas = jnp.stack([jnp.asarray(policy.theta(float(speed))) for (speed,) in speeds])
-    task = nao_walk(duration=4.0, heading_gain=policy.task["heading_gain"])
+    task = nao_walk(duration=4.0, balance=balance_of(policy))
     outcome = evaluate(jax.random.key(0), task, speeds, thetas, repeats=6)
     assert not outcome.fell.any()
     np.testing.assert_allclose(outcome.speed[..., 0].mean(axis=1), speeds[:, 0], atol=0.05)

@@ -28,20 +28,21 @@ from creps_jax.motion.walking.params import (
     WalkParams,
     params_from_theta,
 )
-from creps_jax.motion.walking.posture import corrected_lean
+from creps_jax.motion.walking.posture import Balance, corrected_lean
 from creps_jax.motion.walking.swing import swing_pose
-from creps_jax.rotations import matrix_to_rpy
+from creps_jax.rotations import matrix_to_rpy, rotation_x
 
 THETA = jnp.array([0.001, 0.176, 0.039, 0.224, 0.0, 0.5, 0.5, 0.07, 0.04, 0.1])
 LEVEL = jnp.zeros(3)
 NUM_STEPS = 12
+BALANCE = Balance(heading_gain=0.3, placement_gain=0.6)
 LEFT_LEG, RIGHT_LEG = leg_indices(LEFT), leg_indices(RIGHT)
 
 
 @jax.jit
 def targets_of(theta, time, measured):
     params = params_from_theta(theta)
-    return joint_targets(params, plan_walk(params, NUM_STEPS), time, measured, heading_gain=0.3)
+    return joint_targets(params, plan_walk(params, NUM_STEPS), time, measured, balance=BALANCE)
 
 
 @jax.jit
@@ -219,12 +220,37 @@ def test_heading_hold_turns_the_feet_back_and_is_off_by_default():
     turned_left = jnp.array([0.0, 0.0, 0.2])
     time = 0.95 * params.step_duration  # the right foot is about to land
 
-    def right_foot_yaw(**gain):
-        targets = joint_targets(params, plan, time, turned_left, **gain)
+    def right_foot_yaw(balance):
+        targets = joint_targets(params, plan, time, turned_left, balance=balance)
         return matrix_to_rpy(leg_fk(targets[RIGHT_LEG], RIGHT)[:3, :3])[2]
 
-    np.testing.assert_allclose(right_foot_yaw(), 0.0, atol=1e-5)
-    assert right_foot_yaw(heading_gain=0.5) < -0.03
+    np.testing.assert_allclose(right_foot_yaw(Balance()), 0.0, atol=1e-5)
+    assert right_foot_yaw(Balance(heading_gain=0.5)) < -0.03
+
+
+def test_a_landing_foot_is_put_out_to_where_the_robot_tips_and_that_is_off_by_default():
+    # Without roll gain the feet stay level, and the tilt alone changes nothing about where they are put.
+    params = params_from_theta(THETA.at[6].set(0.0))
+    plan = plan_walk(params, NUM_STEPS)
+
+    def sideways(phase, roll, **balance):
+        """Return how far to the left of the hips the left and the right sole are, in a level frame."""
+        measured = jnp.array([roll, 0.0, 0.0])
+        targets = joint_targets(
+            params, plan, phase * params.step_duration, measured, balance=Balance(**balance)
+        )
+        soles = [
+            rotation_x(roll) @ (leg_fk(targets[leg], side)[:3, 3] - jnp.array([0.0, 0.0, GEOMETRY.hip_z]))
+            for leg, side in ((LEFT_LEG, LEFT), (RIGHT_LEG, RIGHT))
+        ]
+        return np.array([sole[1] for sole in soles])
+
+    tips_right = jnp.float32(0.1)
+    np.testing.assert_allclose(sideways(0.95, tips_right), sideways(0.95, jnp.float32(0.0)), atol=1e-4)
+    for phase, expected in ((0.02, [1.0, 0.0]), (0.98, [0.0, 1.0])):
+        moved = sideways(phase, tips_right, placement_gain=0.5) - sideways(phase, tips_right)
+        # The left foot stands in the first step, the right one lands; to the right is negative.
+        np.testing.assert_allclose(moved, -0.5 * 0.176 * 0.1 * np.array(expected), atol=3e-4)
 
 
 def test_the_plan_holds_its_last_pose_after_its_end():

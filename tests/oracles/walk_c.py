@@ -7,15 +7,17 @@ import numpy as np
 from creps_jax.motion.nao_geometry import MAX_JOINT_SPEED
 from creps_jax.motion.walking.engine import joint_targets, plan_walk
 from creps_jax.motion.walking.params import params_from_theta
+from creps_jax.motion.walking.posture import Balance
 
 CONTROL_PERIOD = 0.02
 NUM_STEPS = 60
+BALANCE = Balance(heading_gain=0.3, placement_gain=0.6)
 
 
 @jax.jit
 def _targets(theta, time, measured):
     params = params_from_theta(theta)
-    return joint_targets(params, plan_walk(params, NUM_STEPS), time, measured, heading_gain=0.3)
+    return joint_targets(params, plan_walk(params, NUM_STEPS), time, measured, balance=BALANCE)
 
 
 def servo_step(model, data, before, after, speed):

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from creps_jax.motion.walking.posture import Balance
 from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, _make_walker, load_nao, nao_walk, record_walk
 from tests.oracles import walk_c
 
@@ -16,7 +17,7 @@ SLOW = (0.002, 0.19, 0.02, 0.30, 3.0, 0.3, 0.3, 0.03, 0.015, 0.1)
 MIDDLE = (0.001, 0.176, 0.039, 0.224, 3.2, 0.46, 0.31, 0.074, 0.038, 0.11)
 FAST = (0.0015, 0.161, 0.041, 0.188, -2.295, 0.427, 0.506, 0.090, 0.007, 0.084)
 FALLING = (0.0, 0.15, 0.06, 0.40, 5.0, 0.0, 0.0, 0.15, 0.0, 0.2)
-GAIN = 0.3
+BALANCE = Balance(heading_gain=0.3, placement_gain=0.6)
 DURATION = 4.0
 SEEDS = 4
 
@@ -33,7 +34,7 @@ def rolled_out(task, thetas, seeds, asked=0.3, seed=1):
 
 @pytest.fixture(scope="module")
 def task():
-    return nao_walk(duration=DURATION, heading_gain=GAIN)
+    return nao_walk(duration=DURATION, balance=BALANCE)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def test_repeats_differ_by_their_keys_and_a_key_repeats(task, outcome):
 @pytest.mark.usefixtures("relaxed_promotion")
 def test_a_record_is_the_same_walk_with_the_speed_of_the_displacement(outcome):
     keys = jax.random.split(jax.random.key(1), 4 * SEEDS)
-    record = jax.jit(lambda key, theta: record_walk(key, theta, duration=DURATION, heading_gain=GAIN))(
+    record = jax.jit(lambda key, theta: record_walk(key, theta, duration=DURATION, balance=BALANCE))(
         keys[SEEDS], jnp.array(MIDDLE)
     )
     start = round(2.0 / 0.02) - 1
@@ -99,7 +100,7 @@ def test_the_solver_is_converged_on_walking_gaits(outcome):
     model = load_nao()
     model.opt.iterations, model.opt.ls_iterations = 30, 30
     reference = rolled_out(
-        nao_walk(duration=DURATION, heading_gain=GAIN, model=model), [SLOW, MIDDLE, FAST], SEEDS
+        nao_walk(duration=DURATION, balance=BALANCE, model=model), [SLOW, MIDDLE, FAST], SEEDS
     )
     np.testing.assert_array_equal(reference.fell, outcome.fell[:3])
     np.testing.assert_allclose(
@@ -114,8 +115,7 @@ def test_the_solver_falls_as_often_as_a_converged_one():
     model.opt.iterations, model.opt.ls_iterations = 30, 30
     noise = WalkNoise(0.018, 0.018, 0.018)
     ours, reference = (
-        rolled_out(nao_walk(heading_gain=GAIN, noise=noise, model=m), [MIDDLE, FAST], 96)
-        for m in (None, model)
+        rolled_out(nao_walk(balance=BALANCE, noise=noise, model=m), [MIDDLE, FAST], 96) for m in (None, model)
     )
     difference = np.abs(ours.fell.mean(axis=1) - reference.fell.mean(axis=1))
     # Two standard deviations of the difference between two shares of a tenth.

@@ -12,11 +12,11 @@ from creps_jax.motion.nao_kinematics import leg_ik
 from creps_jax.motion.walking.com import com_trajectory, spring_height
 from creps_jax.motion.walking.footsteps import Footstep, Stance, next_footstep, standing
 from creps_jax.motion.walking.params import WalkParams
-from creps_jax.motion.walking.posture import corrected_lean
+from creps_jax.motion.walking.posture import Balance, corrected_lean
 from creps_jax.motion.walking.swing import swing_pose
 from creps_jax.motion.walking.zmp import zmp_reference
 from creps_jax.rotations import rigid_transform, rotation_x, rotation_y, rotation_z
-from creps_jax.typing import Array, Float, Scalar, ScalarLike
+from creps_jax.typing import Array, Float, Scalar
 
 __all__ = [
     "BodyPose",
@@ -45,6 +45,8 @@ _SHOULDER_YAW = 0.1
 _ARM_ROLL = 1.57
 _ELBOW = 0.6
 _MAX_HEADING_STEP = 0.15
+# Sideways tilt beyond which a foot is put out no further, rad.
+_MAX_TILT = 0.35
 
 
 class StepPlan(NamedTuple):
@@ -68,8 +70,8 @@ class BodyPose(NamedTuple):
         hips: Position (x, y, z) and yaw of the middle of the hips.
         left: Position (x, y, z) and yaw of the left sole, below the ankle.
         right: That of the right sole.
-        turn: Share of a turn of the trunk in the coming step by which the left foot is turned outwards
-            already; the right foot by the opposite.
+        turn: Share of a turn, -.5 to .5, by which the left foot has turned outwards; the right foot has
+            turned by the opposite. It rises from step to step with the swing of the left foot.
     """
 
     hips: Float[Array, "4"]
@@ -171,7 +173,7 @@ def _above_floor(foot, height):
 
 
 def pose_joints(
-    params: WalkParams, pose: BodyPose, measured_rpy: Float[Array, "3"], *, heading_gain: ScalarLike = 0.0
+    params: WalkParams, pose: BodyPose, measured_rpy: Float[Array, "3"], *, balance: Balance = Balance()
 ) -> Float[Array, "22"]:
     """Pose the joints for a body pose and the measured orientation of the trunk.
 
@@ -180,8 +182,7 @@ def pose_joints(
         pose: Where hips and feet shall be.
         measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw relative to the planned
             heading's origin.
-        heading_gain: Share of the heading error that one step turns back; 0 is the paper's engine, which
-            leaves the heading alone.
+        balance: How steps answer to the measured orientation.
 
     Returns:
         Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad, within the joint limits.
@@ -190,9 +191,14 @@ def pose_joints(
     roll, pitch = corrected_lean(intended, measured_rpy[:2], params.roll_gain, params.tilt_gain)
     R_level_trunk = rotation_y(pitch) @ rotation_x(roll)
     heading_error = jnp.clip(pose.hips[3] - measured_rpy[2], -1.0, 1.0)
-    turn = jnp.clip(heading_gain * heading_error, -_MAX_HEADING_STEP, _MAX_HEADING_STEP) * pose.turn
-    left = leg_ik(_sole_in_torso(pose.hips, pose.left, R_level_trunk, turn), LEFT)
-    right = leg_ik(_sole_in_torso(pose.hips, pose.right, R_level_trunk, -turn), RIGHT)
+    heading_step = balance.heading_gain * heading_error
+    turn = jnp.clip(heading_step, -_MAX_HEADING_STEP, _MAX_HEADING_STEP) * pose.turn
+    # The swing foot is put out more and more; once it stands, the body is carried over it by as much.
+    tilt = jnp.clip(measured_rpy[0], -_MAX_TILT, _MAX_TILT)
+    aside = -balance.placement_gain * params.hip_height * tilt
+    aside_left, aside_right = aside * (0.5 + pose.turn), aside * (0.5 - pose.turn)
+    left = leg_ik(_sole_in_torso(pose.hips, pose.left, R_level_trunk, turn, aside_left), LEFT)
+    right = leg_ik(_sole_in_torso(pose.hips, pose.right, R_level_trunk, -turn, aside_right), RIGHT)
     ahead = jnp.cos(pose.hips[3]) * (pose.left[0] - pose.right[0]) + jnp.sin(pose.hips[3]) * (
         pose.left[1] - pose.right[1]
     )
@@ -200,12 +206,16 @@ def pose_joints(
     return jnp.clip(targets, jnp.asarray(JOINT_LOWER, targets.dtype), jnp.asarray(JOINT_UPPER, targets.dtype))
 
 
-def _sole_in_torso(hips, sole, R_level_trunk, turn):
-    """Transform a sole from the world into the frame of a trunk that leans about the middle of its hips."""
+def _sole_in_torso(hips, sole, R_level_trunk, turn, aside):
+    """Transform a sole from the world into the frame of a trunk that leans about the middle of its hips.
+
+    The sole is turned by `turn` about the hips and put `aside` to the left.
+    """
     R_trunk_level = R_level_trunk.T
     R_heading = rotation_z(turn - hips[3])
     hip_centre = jnp.array([GEOMETRY.hip_x, 0.0, GEOMETRY.hip_z], hips.dtype)
-    position = R_trunk_level @ R_heading @ (sole[:3] - hips[:3]) + hip_centre
+    from_hips = R_heading @ (sole[:3] - hips[:3]) + aside * jnp.array([0.0, 1.0, 0.0], hips.dtype)
+    position = R_trunk_level @ from_hips + hip_centre
     return rigid_transform(R_trunk_level @ R_heading @ rotation_z(sole[3]), position)
 
 
@@ -223,7 +233,7 @@ def joint_targets(
     time: Scalar,
     measured_rpy: Float[Array, "3"],
     *,
-    heading_gain: ScalarLike = 0.0,
+    balance: Balance = Balance(),
 ) -> Float[Array, "22"]:
     """Return the joint targets of a planned walk at a time.
 
@@ -232,12 +242,12 @@ def joint_targets(
         plans: Plans of the steps, stacked (see `plan_walk`).
         time: Time since the start of the first step, s; after the last step the robot holds its last pose.
         measured_rpy: Measured roll, pitch and yaw of the trunk, rad.
-        heading_gain: See `pose_joints`.
+        balance: See `pose_joints`.
 
     Returns:
         Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad.
     """
-    return pose_joints(params, pose_at(params, plans, time), measured_rpy, heading_gain=heading_gain)
+    return pose_joints(params, pose_at(params, plans, time), measured_rpy, balance=balance)
 
 
 def pose_at(params: WalkParams, plans: StepPlan, time: Scalar) -> BodyPose:

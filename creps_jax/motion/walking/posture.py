@@ -1,13 +1,28 @@
-"""Keep the trunk at its intended lean by turning the feet against the measured one."""
+"""Keep the robot upright: turn the feet against the measured lean, place them where it falls to."""
+
+from typing import NamedTuple
 
 import jax.numpy as jnp
 
-from creps_jax.typing import Array, Float, Scalar
+from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["corrected_lean"]
+__all__ = ["Balance", "corrected_lean"]
 
 # A robot that leans further than this has fallen; the correction stays finite.
 _MAX_MEASURED = 0.8
+
+
+class Balance(NamedTuple):
+    """How steps answer to the measured orientation of the trunk; by default, as in the paper, not at all.
+
+    Attributes:
+        heading_gain: Share of the heading error that one step turns back.
+        placement_gain: Share of the way by which a robot that tips over sideways carries its hips out, that
+            a landing foot is put out to the same side.
+    """
+
+    heading_gain: ScalarLike = 0.0
+    placement_gain: ScalarLike = 0.0
 
 
 def corrected_lean(
