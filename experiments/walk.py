@@ -51,7 +51,8 @@ class Settings:
         start_std: its standard deviation before squashing.
         low: lowest speed, m/s.
         high: highest speed, m/s.
-        duration: length of an episode, s.
+        duration: length of an episode of the evaluation, s.
+        learning_duration: length of an episode in learning, s.
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
         placement_gain: how far a landing foot is put out to where the robot tips over, see `Balance`; 0 is
             the paper's engine.
@@ -77,6 +78,7 @@ class Settings:
     low: float = 0.1
     high: float = 0.6
     duration: float = 8.0
+    learning_duration: float = 8.0
     heading_gain: float = 0.0
     placement_gain: float = 0.0
     sampler: str = "gaussian"
@@ -98,7 +100,6 @@ class Settings:
 
 
 _OURS = Settings(
-    archive_size=300,
     heading_gain=0.3,
     placement_gain=0.6,
     sampler="uniform",
@@ -107,7 +108,15 @@ _OURS = Settings(
     start_mean=-0.3,
 )
 SETTINGS = {
-    "quick": dataclasses.replace(_OURS, iterations=85, first_samples=30, learning_noise=1.4),
+    "quick": dataclasses.replace(
+        _OURS,
+        iterations=115,
+        samples=45,
+        first_samples=45,
+        repeats=2,
+        archive_size=450,
+        learning_duration=5.0,
+    ),
     "paper": Settings(trials=5, bounds="paper"),
     "best": dataclasses.replace(_OURS, iterations=120, samples=40, archive_size=400, eval_seeds=50),
 }
@@ -131,7 +140,10 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     evaluate_key, learn_key = jax.random.split(key)
     states, log = learn(
         trial_keys(learn_key, settings.trials),
-        average_repeats(make_task(settings, noise=settings.learning_noise), settings.repeats),
+        average_repeats(
+            make_task(settings, noise=settings.learning_noise, duration=settings.learning_duration),
+            settings.repeats,
+        ),
         algorithm,
         first_policy(settings),
         plan,
@@ -161,12 +173,13 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     }
 
 
-def make_task(settings: Settings, *, noise: float = 1.0) -> Task:
+def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None = None) -> Task:
     """Make the walking task, with parameters that are squashed into their bounds.
 
     Args:
         settings: settings of the experiment.
         noise: how many times the usual noise.
+        duration: length of an episode, s; by default that of the evaluation.
     """
     task = nao_walk(
         settings.low,
@@ -174,7 +187,7 @@ def make_task(settings: Settings, *, noise: float = 1.0) -> Task:
         sample_context=SAMPLERS[settings.sampler](
             settings.low - settings.margin, settings.high + settings.margin
         ),
-        duration=settings.duration,
+        duration=settings.duration if duration is None else duration,
         start_up=START_UP,
         noise=WalkNoise(*(noise * size for size in WalkNoise())),
         balance=settings.balance(),

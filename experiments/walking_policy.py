@@ -116,9 +116,16 @@ def load_walking_policy(path: Path) -> SavedPolicy:
     policy = load_policy(path)
     if policy.param_names != PARAM_NAMES:
         raise UserError(f"{path} is no walking policy: its parameters are {', '.join(policy.param_names)}")
+    try:
+        balance_of(policy)
+    except (KeyError, TypeError):
+        wanted = ", ".join(Balance._fields)
+        raise UserError(
+            f"{path} does not say how its steps were balanced: expected {wanted}, got {dict(policy.task)}"
+        ) from None
     return policy
 
 
 def balance_of(policy: SavedPolicy) -> Balance:
     """Return how the steps of a policy answered to the measured orientation while it was learned."""
-    return Balance(**policy.task.get("balance", {}))
+    return Balance(**policy.task["balance"])

@@ -67,7 +67,7 @@ right.legend()
 #
 # The same algorithm, with the ten parameters of a walking engine for `theta` and the asked speed for the
 # context. This policy was learned with `python -m experiments run walk --preset best`; on two cores that
-# takes about half an hour, so here we load it.
+# takes about a quarter of an hour, so here we load it.
 
 # %%
 from experiments.policy_file import load_policy

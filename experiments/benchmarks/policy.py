@@ -1,6 +1,9 @@
 """Evaluate a walking policy at the paper's 11 speeds, 50 fresh episodes each, beside the paper's Table 2.
 
-python -m experiments.benchmarks.policy [POLICY.npz]; without a file, the shipped policy.
+    python -m experiments.benchmarks.policy [POLICY.npz] [--noise TIMES] [--placement-gain GAIN]
+
+Without a file it is the shipped policy. The options show what more noise, or steps that answer to a sideways
+tilt otherwise than those that the policy was learned with, do to it.
 """
 
 from experiments.process import import_mjx_quietly, prepare
@@ -14,8 +17,9 @@ from pathlib import Path  # noqa: E402
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+import tyro  # noqa: E402
 
-from creps_jax.tasks.nao_walk import nao_walk  # noqa: E402
+from creps_jax.tasks.nao_walk import WalkNoise, nao_walk  # noqa: E402
 from creps_jax.train import evaluate  # noqa: E402
 from experiments import tables  # noqa: E402
 from experiments.errors import UserError  # noqa: E402
@@ -25,12 +29,25 @@ from experiments.walking_policy import balance_of, load_walking_policy  # noqa: 
 SEEDS = 50
 
 
-def main(path: Path) -> None:
-    """Measure and print."""
-    policy = load_walking_policy(path)
+def main(
+    policy: tyro.conf.Positional[Path] = policies_folder() / "walk.npz",  # noqa: B008
+    noise: float = 1.0,
+    placement_gain: float | None = None,
+) -> None:
+    """Measure a policy and print its table.
+
+    Args:
+        policy: Policy file; the shipped one by default.
+        noise: How many times the usual noise.
+        placement_gain: In place of the one that the policy was learned with.
+    """
+    saved = load_walking_policy(policy)
+    balance = balance_of(saved)
+    if placement_gain is not None:
+        balance = balance._replace(placement_gain=placement_gain)
     speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
-    thetas = jnp.stack([jnp.asarray(policy.theta(float(speed))) for speed in speeds])
-    task = nao_walk(balance=balance_of(policy))
+    thetas = jnp.stack([jnp.asarray(saved.theta(float(speed))) for speed in speeds])
+    task = nao_walk(balance=balance, noise=WalkNoise(*(noise * size for size in WalkNoise())))
     outcome = evaluate(jax.random.key(2026), task, jnp.asarray(speeds)[:, None], thetas, repeats=SEEDS)
     reward, speed, fell = (np.asarray(field) for field in (outcome.reward, outcome.speed, outcome.fell))
     print(tables.to_markdown(tables.speed_table(speeds, reward, speed, fell)))
@@ -39,6 +56,6 @@ def main(path: Path) -> None:
 
 if __name__ == "__main__":
     try:
-        main(Path(sys.argv[1]) if len(sys.argv) > 1 else policies_folder() / "walk.npz")
+        tyro.cli(main)
     except UserError as error:
         sys.exit(f"error: {error}")

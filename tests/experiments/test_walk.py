@@ -12,6 +12,7 @@ import pytest
 from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.motion.walking.params import PARAM_NAMES
+from creps_jax.motion.walking.posture import Balance
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.nao_walk import WalkOutcome, nao_walk
 from creps_jax.train import evaluate
@@ -20,7 +21,7 @@ from experiments.cli import main
 from experiments.errors import UserError
 from experiments.policy_file import load_policy, policies_folder
 from experiments.video import Clip, VideoError
-from experiments.walking_policy import balance_of
+from experiments.walking_policy import balance_of, load_walking_policy
 
 
 def stand_in(settings, **_) -> Task:
@@ -97,6 +98,17 @@ def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
     assert main(["run", "walk", "--speed", "0.9", "--policy", "p.npz"]) == 2
     assert "within the learned range, 0.1 to 0.6 m/s, got 0.9" in capsys.readouterr().err
     assert main(["run", "walk", "--speed", "0.5", "--policy", "p.npz"]) == 0
+
+
+@pytest.mark.parametrize("task", [{"heading_gain": 0.3}, {"balance": {"ankle": 1.0}}, {"balance": None}])
+def test_a_policy_that_was_balanced_otherwise_is_refused(tmp_path, task):
+    settings = walk.SETTINGS["quick"]
+    saved = walk.saved_policy(settings, walk.first_policy(settings))
+    walk.save_policy(tmp_path / "p.npz", saved)
+    assert balance_of(load_walking_policy(tmp_path / "p.npz")) == Balance(0.3, 0.6) == settings.balance()
+    walk.save_policy(tmp_path / "p.npz", dataclasses.replace(saved, task=task))
+    with pytest.raises(UserError, match=r"p.npz does not say how its steps were balanced: expected heading"):
+        load_walking_policy(tmp_path / "p.npz")
 
 
 def test_a_machine_without_opengl_only_lacks_the_video(bench, monkeypatch):

@@ -71,7 +71,7 @@ class BodyPose(NamedTuple):
         left: Position (x, y, z) and yaw of the left sole, below the ankle.
         right: That of the right sole.
         turn: Share of a turn, -.5 to .5, by which the left foot has turned outwards; the right foot has
-            turned by the opposite. It rises from step to step with the swing of the left foot.
+            turned by the opposite. It rises while the left foot swings, and falls while the right one does.
     """
 
     hips: Float[Array, "4"]
@@ -193,7 +193,6 @@ def pose_joints(
     heading_error = jnp.clip(pose.hips[3] - measured_rpy[2], -1.0, 1.0)
     heading_step = balance.heading_gain * heading_error
     turn = jnp.clip(heading_step, -_MAX_HEADING_STEP, _MAX_HEADING_STEP) * pose.turn
-    # The swing foot is put out more and more; once it stands, the body is carried over it by as much.
     tilt = jnp.clip(measured_rpy[0], -_MAX_TILT, _MAX_TILT)
     aside = -balance.placement_gain * params.hip_height * tilt
     aside_left, aside_right = aside * (0.5 + pose.turn), aside * (0.5 - pose.turn)

@@ -17,8 +17,10 @@ class Balance(NamedTuple):
 
     Attributes:
         heading_gain: Share of the heading error that one step turns back.
-        placement_gain: Share of the way by which a robot that tips over sideways carries its hips out, that
-            a landing foot is put out to the same side.
+        placement_gain: Share of the way by which a sideways tilt carries the hips out, that a landing foot is
+            put out to the same side. The tilt counts as it is measured at each time. The swing foot is put
+            out by a part of the share that grows to all of it; the other foot keeps what is left of its own
+            while the body is carried over.
     """
 
     heading_gain: ScalarLike = 0.0
