@@ -13,7 +13,16 @@ from creps_jax.linalg import thomas_solve
 from creps_jax.motion.nao_kinematics import leg_fk, leg_ik
 from creps_jax.motion.walking.com import com_trajectory
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
-from creps_jax.tasks import Outcome, Task, average_repeats, penalised, sigmoid_constrained, sinus
+from creps_jax.tasks import (
+    Outcome,
+    Task,
+    average_repeats,
+    hole_reaching,
+    penalised,
+    sigmoid_constrained,
+    sinus,
+    via_point_reaching,
+)
 from creps_jax.train import IterationLog, evaluate, make_iteration, train, train_trials
 
 if TYPE_CHECKING:
@@ -38,6 +47,7 @@ __all__ = [
     "evaluate",
     "fit_weighted_ml",
     "gaussian_contexts",
+    "hole_reaching",
     "leg_fk",
     "leg_ik",
     "linear_features",
@@ -57,6 +67,7 @@ __all__ = [
     "train",
     "train_trials",
     "uniform_contexts",
+    "via_point_reaching",
 ]
 
 

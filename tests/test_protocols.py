@@ -29,6 +29,8 @@ TASKS = {
     "sinus averaged": lambda: average_repeats(sinus(), 3),
     "sinus squashed": lambda: sigmoid_constrained(sinus(), -1.0, 1.0),
     "sinus penalised": lambda: penalised(sinus(), -1.0, 1.0, 10.0),
+    "via_point_reaching": lambda: tasks.via_point_reaching(),
+    "hole_reaching": lambda: tasks.hole_reaching(),
     "nao_walk": lambda: tasks.nao_walk(),
 }
 # A rollout of these takes long to compile: only its shapes and types are looked at.

@@ -16,6 +16,7 @@ from creps_jax.tasks.base import (
     penalised,
     sigmoid_constrained,
 )
+from creps_jax.tasks.planar_arm import hole_reaching, via_point_reaching
 from creps_jax.tasks.sinus import sinus
 
 if TYPE_CHECKING:
@@ -26,10 +27,12 @@ __all__ = [
     "PlainOutcome",
     "Task",
     "average_repeats",
+    "hole_reaching",
     "nao_walk",
     "penalised",
     "sigmoid_constrained",
     "sinus",
+    "via_point_reaching",
 ]
 
 _LAZY = ("nao_walk",)

@@ -1,0 +1,205 @@
+"""A planar arm of three links that reaches via-points, or into a hole in the ground, moved by DMPs."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from creps_jax.contexts import gaussian_contexts
+from creps_jax.motion.dmp import DmpTrajectory, dmp_trajectory
+from creps_jax.tasks.base import PlainOutcome, Task
+from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar, ScalarLike, VectorLike
+
+__all__ = [
+    "HoleOutcome",
+    "arm_points",
+    "hits_ground",
+    "hole_movement",
+    "hole_reaching",
+    "via_point_movement",
+    "via_point_reaching",
+]
+
+NUM_LINKS = 3
+NUM_BASIS = 5
+NUM_STEPS = 100
+DURATION = 3.0
+_VIA_STEP = 50
+# The arm starts pointing straight up, and ends the via-point task stretched out along the ground.
+_START = (0.0, 0.0, 0.0)
+_STRETCHED = (0.5 * math.pi, 0.0, 0.0)
+_STRETCHED_POINT = (3.0, 0.0)
+
+
+class HoleOutcome(NamedTuple):
+    """What reaching into the hole brings.
+
+    Attributes:
+        reward: See `hole_reaching`.
+        violation: Empty.
+        num_collisions: Time steps at which a link is in the ground.
+        distance: Last distance of the end effector from the middle of the hole's floor, m.
+    """
+
+    reward: Float[Array, ""]
+    violation: Float[Array, " c"]
+    num_collisions: Float[Array, ""]
+    distance: Float[Array, ""]
+
+
+def via_point_reaching(
+    low: VectorLike = (-1.5, -1.5),
+    high: VectorLike = (-0.5, -0.5),
+    *,
+    sample_context: Callable[[PRNGKey], Array] | None = None,
+) -> Task:
+    """Ask an arm to pass a point half-way, and to end stretched out to the right.
+
+    The context is the via-point (x, y), m; theta holds the weights of the DMPs, a row of
+    three joints for each of five bases, rad. The goal of the DMPs is the stretched posture. The reward is
+    `-1e4 (|p_50 - v|^2 + |p_100 - (3, 0)|^2) - .5 sum |acceleration|^2`, over 100 steps of .03 s.
+
+    Args:
+        low: Lower ends of the via-point's range, m.
+        high: Upper ends of it, m.
+        sample_context: (key) -> via-point (2,); by default Gaussian about the middle, clipped to the range.
+
+    Returns:
+        The task; it has no noise.
+
+    Raises:
+        ValueError: If the range is not in order.
+
+    Source: Abdolmaleki et al. 2016, Section 4.2; the end point (5, 0) in print is out of reach.
+    """
+    default = gaussian_contexts(low, high, clip=True)
+    sample_context = default if sample_context is None else sample_context
+
+    def rollout(key: PRNGKey, context: Float[Array, "2"], theta: Float[Array, "15"]) -> PlainOutcome:
+        del key
+        movement = via_point_movement(theta)
+        tips = jax.vmap(arm_points)(movement.pos)[:, -1]
+        miss = jnp.sum(jnp.square(tips[_VIA_STEP - 1] - context))
+        miss = miss + jnp.sum(jnp.square(tips[-1] - jnp.array(_STRETCHED_POINT, theta.dtype)))
+        reward = -1e4 * miss - 0.5 * jnp.sum(jnp.square(movement.acc))
+        return PlainOutcome(reward, jnp.zeros(0, theta.dtype))
+
+    return Task(sample_context, rollout, context_dim=2, theta_dim=NUM_BASIS * NUM_LINKS, worst_reward=-1e7)
+
+
+def hole_reaching(
+    low: float = 1.4,
+    high: float = 2.0,
+    *,
+    width: float = 0.3,
+    depth: float = 1.0,
+    sample_context: Callable[[PRNGKey], Array] | None = None,
+) -> Task:
+    """Ask an arm to end at the bottom of a hole in the ground, without touching ground or walls.
+
+    The context is the x of the hole's middle, m; theta holds the weights of the DMPs, a row of three joints
+    for each of five bases, and then their goals, rad. The reward is
+    `-1e5 (d^2 + number of steps in collision) - 10 sum |acceleration|^2`, over 100 steps of .03 s. Here d is
+    the last distance from the middle of the hole's floor, but after a collision no less than the first one:
+    a movement through the ground has reached nothing. So colliding never beats standing still.
+
+    Args:
+        low: Lowest middle of the hole, m.
+        high: Highest one, m.
+        width: Width of the hole, m.
+        depth: Depth of the hole, m.
+        sample_context: (key) -> middle (1,); by default Gaussian about the range's middle, clipped to it.
+
+    Returns:
+        The task; it has no noise.
+
+    Raises:
+        ValueError: If the range is not in order, or the hole is not one.
+
+    Source: Abdolmaleki et al. 2016, Section 4.2; the weights 1e5 and 10, and the length of a step, are those
+        of its author's published settings.
+    """
+    if not (width > 0.0 and depth > 0.0):
+        raise ValueError(f"the hole must have a width and a depth, got {width} and {depth}")
+    default = gaussian_contexts(low, high, clip=True)
+    sample_context = default if sample_context is None else sample_context
+
+    def rollout(key: PRNGKey, context: Float[Array, "1"], theta: Float[Array, "18"]) -> HoleOutcome:
+        del key
+        movement = hole_movement(theta)
+        points = jax.vmap(arm_points)(movement.pos)
+        hits = jax.vmap(lambda posture: hits_ground(posture, context[0], width, depth))(points)
+        num_collisions = jnp.sum(hits, dtype=theta.dtype)
+        floor = jnp.stack([context[0], jnp.asarray(-depth, context.dtype)])
+        first = jnp.sum(jnp.square(arm_points(jnp.array(_START, theta.dtype))[-1] - floor))
+        last = jnp.sum(jnp.square(points[-1, -1] - floor))
+        missed = jnp.where(num_collisions > 0, jnp.maximum(first, last), last)
+        reward = -1e5 * (missed + num_collisions) - 10.0 * jnp.sum(jnp.square(movement.acc))
+        return HoleOutcome(reward, jnp.zeros(0, theta.dtype), num_collisions, jnp.sqrt(last))
+
+    theta_dim = (NUM_BASIS + 1) * NUM_LINKS
+    return Task(sample_context, rollout, context_dim=1, theta_dim=theta_dim, worst_reward=-1e8)
+
+
+def via_point_movement(theta: Float[Array, "15"]) -> DmpTrajectory:
+    """Return the joints' movement in `via_point_reaching`, rad and s."""
+    return _movement(theta, jnp.array(_STRETCHED, theta.dtype))
+
+
+def hole_movement(theta: Float[Array, "18"]) -> DmpTrajectory:
+    """Return the joints' movement in `hole_reaching`, rad and s."""
+    return _movement(theta[:-NUM_LINKS], theta[-NUM_LINKS:])
+
+
+def arm_points(joint_pos: Float[Array, " k"]) -> Float[Array, "k+1 2"]:
+    """Return the ends of the links of 1 m, from the base at the origin to the end effector.
+
+    Args:
+        joint_pos: Angle of each link from the one before it, the first from the vertical, clockwise, rad.
+
+    Returns:
+        Points (x, y), m.
+    """
+    angle = jnp.cumsum(joint_pos)
+    ends = jnp.cumsum(jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=1), axis=0)
+    return jnp.concatenate([jnp.zeros((1, 2), ends.dtype), ends])
+
+
+def hits_ground(
+    points: Float[Array, "n 2"], center: Scalar, width: ScalarLike, depth: ScalarLike
+) -> Bool[Array, ""]:
+    """Say whether any part of a chain of links is in the ground, which has one hole.
+
+    It is exact: what lies below the ground's surface of a link is a segment, and the hole is convex, so the
+    two ends of that segment tell whether all of it is in the hole.
+
+    Args:
+        points: Ends of the links, m; the ground's surface is y = 0, and touching it is no collision.
+        center: Middle of the hole, m.
+        width: Width of the hole, m.
+        depth: Depth of the hole, m.
+
+    Returns:
+        Whether there is a collision.
+    """
+    begin, end = points[:-1], points[1:]
+    rise = end[:, 1] - begin[:, 1]
+    # Where the link passes y = 0; without a pass neither value is used.
+    share = -begin[:, 1] / jnp.where(rise == 0.0, 1.0, rise)
+    crossing = begin[:, 0] + share * (end[:, 0] - begin[:, 0])
+    is_below = points[:, 1] < 0.0
+    passes = is_below[:-1] != is_below[1:]
+    is_in_hole = (jnp.abs(points[:, 0] - center) <= 0.5 * width) & (points[:, 1] >= -depth)
+    crosses_in_hole = jnp.abs(crossing - center) <= 0.5 * width
+    return jnp.any(is_below & ~is_in_hole) | jnp.any(passes & ~crosses_in_hole)
+
+
+def _movement(weights: Array, goal: Array) -> DmpTrajectory:
+    if weights.size != NUM_BASIS * NUM_LINKS or goal.size != NUM_LINKS:
+        raise ValueError(f"theta has the wrong size: {weights.size} weights and {goal.size} goals")
+    start = jnp.array(_START, goal.dtype)
+    return dmp_trajectory(
+        weights.reshape(NUM_BASIS, NUM_LINKS), start, goal, duration=DURATION, num_steps=NUM_STEPS
+    )
