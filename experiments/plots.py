@@ -256,6 +256,60 @@ def plot_policy(
     axes.legend(loc="upper center", ncols=2)
 
 
+def final_values(values: Mapping[str, np.ndarray], *, label: str, log: bool = False) -> Figure:
+    """Draw one number of each trial of each contender, with the mean and its 95 % interval.
+
+    Args:
+        values: (trials,) by name.
+        label: name of the number, with its unit.
+        log: whether the axis is logarithmic.
+    """
+    figure, axes = new_figure(width=6.4, height=0.6 * len(values) + 1.6)
+    axes = axes[0, 0]
+    for row, trials in enumerate(values.values()):
+        low, high = confidence_interval(trials)
+        colour = COLOURS[row % len(COLOURS)]
+        axes.plot(trials, np.full(len(trials), row), "o", color=colour, alpha=0.35, markersize=4)
+        mean = float(np.mean(trials))
+        axes.errorbar(mean, row, xerr=[[mean - low], [high - mean]], fmt="D", color=colour, capsize=4)
+        axes.annotate(f"{mean:.3g}", (mean, row), xytext=(0, 7), textcoords="offset points", ha="center")
+    positive = [value for trials in values.values() for value in trials if value > 0]
+    if log and positive:
+        # Zero keeps its place.
+        axes.set_xscale("symlog", linthresh=min(positive))
+    num_trials = len(next(iter(values.values())))
+    axes.set_yticks(range(len(values)), labels=list(values))
+    axes.set(xlabel=label, title=f"After learning (n = {num_trials}, mean and 95 % interval)")
+    axes.margins(y=0.25)
+    axes.invert_yaxis()
+    return figure
+
+
+def plot_postures(axes: Axes, points: np.ndarray, *, num: int = 21) -> None:
+    """Draw postures of an arm over time, later ones darker.
+
+    Args:
+        axes: where to.
+        points: (n, k, 2) ends of the links at each time, m.
+        num: number of postures, equally spaced in time, the last one among them.
+    """
+    shown = np.linspace(0, len(points) - 1, num).round().astype(int)
+    for share, index in zip(np.linspace(0.1, 1.0, num), shown, strict=True):
+        axes.plot(
+            *points[index].T, color=COLOURS[0], alpha=share**1.5, linewidth=2.0, marker="o", markersize=3
+        )
+    axes.plot(*points[:, -1].T, color=COLOURS[2], linewidth=1.0)
+    axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal")
+
+
+def plot_ground(axes: Axes, center: float, width: float, depth: float) -> None:
+    """Draw the ground with its hole, m."""
+    left, right = center - 0.5 * width, center + 0.5 * width
+    low, high = axes.get_xlim()
+    x = [min(low, -1.0), left, left, right, right, max(high, 3.0)]
+    axes.plot(x, [0.0, 0.0, -depth, -depth, 0.0, 0.0], color=FALL_COLOUR, linewidth=1.5)
+
+
 def _mean_of_finite(samples: np.ndarray) -> np.ndarray:
     is_finite = np.isfinite(samples)
     total = np.where(is_finite, samples, 0.0).sum(axis=0)

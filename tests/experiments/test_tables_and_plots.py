@@ -77,6 +77,12 @@ def figures():
     _, axes = plots.new_figure()
     plots.plot_policy(axes[0, 0], asked, theta[..., 0], asked, title="title", labels=("s", "theta"))
     yield "policy", axes[0, 0].figure
+    values = {"a": rng.uniform(size=5), "b": rng.uniform(size=5)}
+    yield "final", plots.final_values(values, label="regret", log=True)
+    _, axes = plots.new_figure()
+    plots.plot_postures(axes[0, 0], rng.normal(size=(100, 4, 2)))
+    plots.plot_ground(axes[0, 0], 1.7, 0.3, 1.0)
+    yield "postures", axes[0, 0].figure
 
 
 def test_figures_can_be_drawn_and_saved(tmp_path):

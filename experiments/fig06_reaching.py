@@ -1,0 +1,121 @@
+"""Reach via-points with a planar arm (Abdolmaleki et al. 2016, 4.2, Fig. 6 and 7)."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
+from creps_jax.features import linear_features, quadratic_features, rbf_features
+from creps_jax.tasks.planar_arm import arm_points, via_point_movement, via_point_reaching
+from experiments import plots
+from experiments.comparison import compare, make_contender, mean_policy_curve, p_value, postures, regret
+from experiments.learning import Plan, Session
+from experiments.registry import Claim
+
+LOW, HIGH = (-1.5, -1.5), (-0.5, -0.5)
+SHOWN = ((-1.25, -0.75), (-0.75, -1.25))
+LABELS = {"linear": "linear", "rbf": "RBFs", "uniform": "linear, uniform contexts"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of the experiment; the paper gives samples, archive, KL bound and number of RBFs.
+
+    Attributes:
+        iterations: iterations of learning.
+        trials: trials of each curve; the paper has 5.
+        samples: N, new samples of an iteration.
+        archive_size: L, samples kept.
+        kl_bound: epsilon, nats.
+        num_centers: K, along each of the two contexts.
+        ridge: relative penalty on the policy's coefficients.
+        start_std: standard deviation of the first policy, whose mean is zero, rad.
+    """
+
+    iterations: int = 1000
+    trials: int = 20
+    samples: int = 40
+    archive_size: int = 2000
+    kl_bound: float = 0.5
+    num_centers: int = 2
+    ridge: float = 1e-4
+    start_std: float = 1.0
+
+
+SETTINGS = {"paper": Settings(), "quick": Settings(iterations=200, trials=5)}
+
+
+def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
+    """Learn with linear and RBF features, and with uniform contexts.
+
+    Returns:
+        The arrays of `compare`, with the contenders linear, rbf and uniform.
+    """
+    linear = (linear_features(2), quadratic_features(2))
+    rbf = rbf_features(LOW, HIGH, settings.num_centers)
+    gaussian, uniform = gaussian_contexts(LOW, HIGH, clip=True), uniform_contexts(LOW, HIGH)
+    contenders = {
+        name: make_contender(via_point_reaching(LOW, HIGH, sample_context=sampler), features, settings)
+        for name, features, sampler in (
+            ("linear", linear, gaussian),
+            ("rbf", (rbf, rbf), gaussian),
+            ("uniform", linear, uniform),
+        )
+    }
+    plan = Plan(settings.iterations, settings.samples)
+    grid = context_grid(LOW, HIGH, 6)
+    arrays = compare(contenders, plan, key, trials=settings.trials, grid=grid, session=session)
+    for name in ("linear", "rbf"):
+        arrays[f"{name}.postures"] = postures(
+            contenders[name],
+            arrays[f"{name}.coef"][0],
+            jnp.array(SHOWN),
+            lambda theta: jax.vmap(arm_points)(via_point_movement(theta).pos),
+        )
+    return arrays
+
+
+def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+    """Draw Fig. 6a and 6b, the last regrets, and the arm's postures (Fig. 7)."""
+    panels = {
+        "Linear and RBF policies": ("linear", "rbf"),
+        "Gaussian and uniform contexts": ("linear", "uniform"),
+    }
+    figure, axes = plots.new_figure(2, len(SHOWN), width=8.0, height=7.4)
+    for row, name in enumerate(("linear", "rbf")):
+        for column, point in enumerate(SHOWN):
+            plots.plot_postures(axes[row, column], arrays[f"{name}.postures"][column])
+            axes[row, column].plot(*point, "x", color=plots.FALL_COLOUR, markersize=10, markeredgewidth=2)
+            axes[row, column].set_title(f"{LABELS[name]}: via-point ({point[0]:g}, {point[1]:g})")
+    return {
+        "learning_curve": plots.learning_curves(
+            {
+                title: {LABELS[name]: mean_policy_curve(arrays, name) for name in names}
+                for title, names in panels.items()
+            }
+        ),
+        "final": plots.final_values(
+            {LABELS[name]: regret(arrays, name) for name in LABELS}, label="regret over the grid", log=True
+        ),
+        "postures": figure,
+    }
+
+
+CLAIMS = (
+    Claim(
+        "RBFs reach better than linear policies: p of Wilcoxon's test",
+        None,
+        lambda arrays: p_value(arrays, "rbf", "linear"),
+        high=0.05,
+    ),
+    Claim(
+        "Gaussian contexts are better than uniform ones: p of the same test",
+        None,
+        lambda arrays: p_value(arrays, "linear", "uniform"),
+        high=0.05,
+    ),
+)

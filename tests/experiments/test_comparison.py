@@ -1,0 +1,70 @@
+"""Comparisons of learners, and the figures that are made of them."""
+
+import dataclasses
+import importlib
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import comparison
+from experiments.errors import UserError
+from experiments.fig08_hole import Settings as HoleSettings
+from experiments.learning import Session
+
+
+def made_up(**final):
+    """Return arrays of contenders whose mean policies end with the given rewards (trials, contexts)."""
+    arrays = {"episodes": np.array([10, 20, 30]), "evaluated": np.array([1, 3])}
+    for name, rewards in final.items():
+        last = np.array(rewards, float)
+        arrays[f"{name}.grid_reward"] = np.stack([last - 7.0, last], axis=1)
+    return arrays
+
+
+def test_regret_is_what_is_missing_to_the_best_known_at_each_context():
+    arrays = made_up(a=[[-1.0, -4.0], [-2.0, -3.0]], b=[[-3.0, 0.0], [-5.0, -5.0]])
+    # Best known: -1 and 0.
+    np.testing.assert_allclose(comparison.regret(arrays, "a"), [2.0, 2.0])
+    np.testing.assert_allclose(comparison.regret(arrays, "b"), [1.0, 4.5])
+
+
+def test_curves_stand_at_the_episodes_of_the_evaluated_iterations():
+    episodes, curve = comparison.mean_policy_curve(made_up(a=[[-1.0, -3.0]]), "a")
+    np.testing.assert_array_equal(episodes, [10, 30])
+    np.testing.assert_allclose(curve, [[-9.0, -2.0]])
+
+
+def test_a_difference_is_believed_when_all_trials_show_it():
+    rng = np.random.default_rng(0)
+    good, bad = -rng.uniform(1, 2, (10, 3)), -rng.uniform(2, 3, (10, 3))
+    arrays = made_up(good=good, bad=bad, same=good)
+    assert comparison.p_value(arrays, "good", "bad") == pytest.approx(2.0**-10)
+    assert comparison.p_value(arrays, "bad", "good") == pytest.approx(1.0)
+    assert comparison.p_value(arrays, "good", "same") == 1.0
+
+
+@pytest.mark.parametrize("name", ["fig05_sinus", "fig06_reaching", "fig08_hole"])
+def test_a_figure_learns_draws_and_judges(name):
+    experiment = importlib.import_module(f"experiments.{name}")
+    few = {"iterations": 2, "trials": 2, "samples": 30, "archive_size": 60}
+    settings = dataclasses.replace(experiment.SETTINGS["quick"], **few)
+    arrays = experiment.run(settings, jax.random.key(0), Session())
+    names = [key.removesuffix(".coef") for key in arrays if key.endswith(".coef")]
+    assert len(names) >= 2
+    for contender in names:
+        assert arrays[f"{contender}.sample_reward"].shape == (2, 2)
+        assert arrays[f"{contender}.grid_reward"].shape == (2, 2, len(arrays["context"]))
+        # Two trials are two searches.
+        assert not np.array_equal(*arrays[f"{contender}.sample_reward"])
+        assert not np.array_equal(*arrays[f"{contender}.coef"])
+    assert len(experiment.plot(arrays)) >= 2
+    for claim in experiment.CLAIMS:
+        value = claim.measure(arrays)
+        # What needs other numbers of RBFs says so.
+        assert np.isfinite(value) or "numbers of RBFs" in claim.metric
+
+
+def test_the_hole_needs_the_number_of_rbfs_of_the_paper():
+    with pytest.raises(UserError, match=r"must have 6, the paper's, among them, got \(2, 4\)"):
+        HoleSettings(num_centers=(2, 4))
