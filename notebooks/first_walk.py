@@ -124,11 +124,12 @@ except VideoError as error:
 # below are yours.
 
 # %%
+ask, tell = jax.jit(algorithm.ask), jax.jit(algorithm.tell)
 state = algorithm.init(start)
 for iteration in range(3):
     key = jax.random.fold_in(jax.random.key(1), iteration)
     contexts = jax.random.uniform(key, (40, 1), minval=low, maxval=high)
-    thetas = algorithm.ask(key, state, contexts)
+    thetas = ask(key, state, contexts)
     rewards = -(jnp.squeeze(thetas - jnp.sin(contexts)) ** 2)
-    state, info = algorithm.tell(state, cj.Batch(contexts, thetas, rewards))
+    state, info = tell(state, cj.Batch(contexts, thetas, rewards))
     print(f"mean reward {rewards.mean():.3f}, moved by {info.policy_kl:.2f} nats")

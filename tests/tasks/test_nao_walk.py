@@ -92,7 +92,7 @@ def test_speed_and_falls_agree_with_c_mujoco(outcome):
 
 def _start_of(theta):
     """Return the position in which a walk begins, without noise."""
-    begin, _ = _make_walker(None, 0.1, WalkNoise(0.0, 0.0, 0.0), 0.0)
+    begin, _ = _make_walker(None, 0.1, WalkNoise(0.0, 0.0, 0.0), Balance())
     return np.asarray(begin(jax.random.key(0), theta).robot.qpos, float)
 
 
