@@ -2,8 +2,10 @@
 
     python -m experiments.benchmarks.rollouts
 
-Each round runs all three in turn; the ratios are medians over the rounds. Ours have the controller in the
-loop; C MuJoCo replays the set-points of such a walk with `mujoco.rollout`, one thread a core.
+Each round runs all in turn; the ratios are medians over the rounds. Ours have the controller in the loop; C
+MuJoCo replays the set-points of such a walk with `mujoco.rollout`, one thread a core. What C gains from all
+threads over one tells how far this machine scales at all: cores that share a chip with others slow down
+when all are busy.
 """
 
 from experiments.process import import_mjx_quietly, prepare, usable_cores
@@ -39,6 +41,7 @@ def main() -> None:
         "all devices": _ours(jax.devices()),
         "one device": _ours(jax.devices()[:1]),
         "C MuJoCo": _bare_c(model, cores),
+        "C, one thread": _bare_c(model, 1),
     }
     for run in contestants.values():
         run()
@@ -52,10 +55,13 @@ def main() -> None:
     print(f"{cores} cores, {jax.device_count()} devices, batch {BATCH}, {ROUNDS} rounds")
     print("physics steps a second, median (least to most):")
     for name, values in rates.items():
-        print(f"  {name:12} {np.median(values):10,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
-    ours = np.array(rates["all devices"])
-    for name in ("one device", "C MuJoCo"):
-        print(f"all devices / {name}: {np.median(ours / np.array(rates[name])):.2f}")
+        print(f"  {name:14} {np.median(values):10,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
+    for one, other in (
+        ("all devices", "one device"),
+        ("all devices", "C MuJoCo"),
+        ("C MuJoCo", "C, one thread"),
+    ):
+        print(f"{one} / {other}: {np.median(np.divide(rates[one], rates[other])):.2f}")
 
 
 def _ours(devices: list[jax.Device]) -> Callable[[], None]:
