@@ -1,7 +1,8 @@
 """Compare ways to learn: trials of each, judged by their mean policies on one grid of contexts."""
 
-from collections.abc import Callable, Mapping
-from typing import NamedTuple, Protocol
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,28 +33,27 @@ class Contender(NamedTuple):
     start: LinearGaussian
 
 
-class LearnerSettings(Protocol):
-    """The settings of an experiment that `make_contender` reads."""
+@dataclasses.dataclass(frozen=True)
+class LearnerSettings:
+    """Settings that all comparisons have; the paper gives samples, archive and KL bound.
 
-    @property
-    def kl_bound(self) -> float:
-        """The bound epsilon, nats."""
-        ...
+    Attributes:
+        iterations: iterations of learning.
+        trials: trials of each contender; the paper has 5.
+        samples: N, new samples of an iteration.
+        archive_size: L, samples kept.
+        kl_bound: epsilon, nats.
+        ridge: relative penalty on the policy's coefficients.
+        start_std: standard deviation of the first policy, whose mean is zero.
+    """
 
-    @property
-    def archive_size(self) -> int:
-        """L, samples kept."""
-        ...
-
-    @property
-    def ridge(self) -> float:
-        """Relative penalty on the policy's coefficients."""
-        ...
-
-    @property
-    def start_std(self) -> float:
-        """Standard deviation of the first policy, whose mean is zero."""
-        ...
+    iterations: int = 1000
+    trials: int = 20
+    samples: int = 40
+    archive_size: int = 2000
+    kl_bound: float = 0.5
+    ridge: float = 1e-4
+    start_std: float = 1.0
 
 
 def make_contender(
@@ -70,10 +70,9 @@ def make_contender(
 
 def compare(
     contenders: Mapping[str, Contender],
-    plan: Plan,
+    settings: LearnerSettings,
     key: jax.Array,
     *,
-    trials: int,
     grid: jax.Array,
     session: Session = Session(),
 ) -> dict[str, np.ndarray]:
@@ -81,9 +80,8 @@ def compare(
 
     Args:
         contenders: by name; all begin with the same keys.
-        plan: iterations and samples.
+        settings: iterations, trials and samples.
         key: random key.
-        trials: trials of each.
         grid: (n, s) contexts to judge on.
         session: where to keep checkpoints and show progress.
 
@@ -94,6 +92,7 @@ def compare(
     """
     # Rollouts as short as these are not worth sharing out.
     devices = jax.local_devices()[:1]
+    plan = Plan(settings.iterations, settings.samples)
     learn_key, evaluate_key = jax.random.split(key)
     evaluated = np.unique(np.linspace(1, plan.iterations, NUM_EVALUATED).round().astype(int))
     arrays = {
@@ -101,14 +100,14 @@ def compare(
         "evaluated": evaluated,
         "context": np.asarray(grid),
     }
-    keys = trial_keys(learn_key, trials)
-    for name, (task, algorithm, start) in contenders.items():
-        _, log = learn(keys, task, algorithm, start, plan, session=session, name=name, devices=devices)
+    keys = trial_keys(learn_key, settings.trials)
+    for name, contender in contenders.items():
+        _, log = learn(keys, *contender, plan, session=session, name=name, devices=devices)
         # A resumed run may have gone on for longer than is asked of it now.
         coef = log["coef"][:, evaluated - 1]
         arrays[f"{name}.sample_reward"] = log["mean_reward"][:, : plan.iterations]
         arrays[f"{name}.kl"] = log["info.kl"][:, : plan.iterations]
-        arrays[f"{name}.grid_reward"] = _grid_reward(evaluate_key, task, algorithm, coef, grid)
+        arrays[f"{name}.grid_reward"] = _grid_reward(evaluate_key, contender, coef, grid)
         arrays[f"{name}.coef"] = coef[:, -1]
     return arrays
 
@@ -116,6 +115,21 @@ def compare(
 def mean_policy_curve(arrays: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return episodes, and the mean reward over the grid of each trial's mean policy (trials, evaluated)."""
     return arrays["episodes"][arrays["evaluated"] - 1], arrays[f"{name}.grid_reward"].mean(axis=2)
+
+
+def learning_panels(
+    arrays: Mapping[str, np.ndarray], panels: Mapping[str, Iterable[str]], labels: Mapping[str, str]
+) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Return what `plots.learning_curves` draws: by title, the labelled curves of some contenders."""
+    return {
+        title: {labels[name]: mean_policy_curve(arrays, name) for name in names}
+        for title, names in panels.items()
+    }
+
+
+def last_regrets(arrays: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return what `plots.final_values` draws: the labelled regrets (trials,) of all contenders."""
+    return {label: regret(arrays, name) for name, label in labels.items()}
 
 
 def regret(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
@@ -137,24 +151,24 @@ def p_value(arrays: Mapping[str, np.ndarray], better: str, worse: str) -> float:
     return float(stats.wilcoxon(differences, alternative="less").pvalue) if differences.any() else 1.0
 
 
+def mean_thetas(contender: Contender, coef: np.ndarray | jax.Array, contexts: jax.Array) -> jax.Array:
+    """Return what a mean policy (p, d) gives at contexts (n, s), as (n, d)."""
+    policy = LinearGaussian(jnp.asarray(coef), contender.start.cov_chol)
+    return contender.algorithm.mean(policy, contexts)
+
+
 def postures(
     contender: Contender, coef: np.ndarray, contexts: jax.Array, points: Callable[[jax.Array], jax.Array]
 ) -> np.ndarray:
     """Return the postures of an arm under a mean policy: what `points` makes of each context's theta."""
-    policy = LinearGaussian(jnp.asarray(coef), contender.start.cov_chol)
-    return np.asarray(jax.vmap(points)(contender.algorithm.mean(policy, contexts)))
+    return np.asarray(jax.vmap(points)(mean_thetas(contender, coef, contexts)))
 
 
-def _grid_reward(
-    key: jax.Array, task: Task, algorithm: Creps, coef: np.ndarray, grid: jax.Array
-) -> np.ndarray:
+def _grid_reward(key: jax.Array, contender: Contender, coef: np.ndarray, grid: jax.Array) -> np.ndarray:
     """Return the reward of mean policies (trials, k, p, d) at contexts (n, s), as (trials, k, n)."""
     trials, num, _, dim = coef.shape
-
-    def mean(coef: jax.Array) -> jax.Array:
-        return algorithm.mean(LinearGaussian(coef, jnp.eye(dim)), grid)
-
-    thetas = jax.vmap(jax.vmap(mean))(jnp.asarray(coef)).reshape(-1, dim)
+    means = jax.vmap(jax.vmap(lambda coef: mean_thetas(contender, coef, grid)))(jnp.asarray(coef))
     contexts = jnp.tile(grid, (trials * num, 1))
-    outcome = evaluate(key, task, contexts, thetas, devices=jax.local_devices()[:1])
+    devices = jax.local_devices()[:1]
+    outcome = evaluate(key, contender.task, contexts, means.reshape(-1, dim), devices=devices)
     return np.asarray(outcome.reward).reshape(trials, num, len(grid))

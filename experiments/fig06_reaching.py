@@ -12,8 +12,16 @@ from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
 from creps_jax.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, via_point_movement, via_point_reaching
 from experiments import plots
-from experiments.comparison import compare, make_contender, mean_policy_curve, p_value, postures, regret
-from experiments.learning import Plan, Session
+from experiments.comparison import (
+    LearnerSettings,
+    compare,
+    last_regrets,
+    learning_panels,
+    make_contender,
+    p_value,
+    postures,
+)
+from experiments.learning import Session
 from experiments.registry import Claim
 
 LOW, HIGH = (-1.5, -1.5), (-0.5, -0.5)
@@ -22,28 +30,14 @@ LABELS = {"linear": "linear", "rbf": "RBFs", "uniform": "linear, uniform context
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """Settings of the experiment; the paper gives samples, archive, KL bound and number of RBFs.
+class Settings(LearnerSettings):
+    """Settings of the experiment; the unit of parameters, and so of `start_std`, is rad.
 
     Attributes:
-        iterations: iterations of learning.
-        trials: trials of each curve; the paper has 5.
-        samples: N, new samples of an iteration.
-        archive_size: L, samples kept.
-        kl_bound: epsilon, nats.
-        num_centers: K, along each of the two contexts.
-        ridge: relative penalty on the policy's coefficients.
-        start_std: standard deviation of the first policy, whose mean is zero, rad.
+        num_centers: K, along each of the two contexts, as in the paper.
     """
 
-    iterations: int = 1000
-    trials: int = 20
-    samples: int = 40
-    archive_size: int = 2000
-    kl_bound: float = 0.5
     num_centers: int = 2
-    ridge: float = 1e-4
-    start_std: float = 1.0
 
 
 SETTINGS = {"paper": Settings(), "quick": Settings(iterations=200, trials=5)}
@@ -66,9 +60,8 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
             ("uniform", linear, uniform),
         )
     }
-    plan = Plan(settings.iterations, settings.samples)
     grid = context_grid(LOW, HIGH, 6)
-    arrays = compare(contenders, plan, key, trials=settings.trials, grid=grid, session=session)
+    arrays = compare(contenders, settings, key, grid=grid, session=session)
     for name in ("linear", "rbf"):
         arrays[f"{name}.postures"] = postures(
             contenders[name],
@@ -92,15 +85,8 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
             axes[row, column].plot(*point, "x", color=plots.FALL_COLOUR, markersize=10, markeredgewidth=2)
             axes[row, column].set_title(f"{LABELS[name]}: via-point ({point[0]:g}, {point[1]:g})")
     return {
-        "learning_curve": plots.learning_curves(
-            {
-                title: {LABELS[name]: mean_policy_curve(arrays, name) for name in names}
-                for title, names in panels.items()
-            }
-        ),
-        "final": plots.final_values(
-            {LABELS[name]: regret(arrays, name) for name in LABELS}, label="regret over the grid", log=True
-        ),
+        "learning_curve": plots.learning_curves(learning_panels(arrays, panels, LABELS)),
+        "final": plots.final_values(last_regrets(arrays, LABELS), label="regret over the grid", log=True),
         "postures": figure,
     }
 

@@ -12,9 +12,17 @@ from creps_jax.contexts import context_grid
 from creps_jax.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, hole_movement, hole_reaching
 from experiments import plots
-from experiments.comparison import compare, make_contender, mean_policy_curve, p_value, postures, regret
+from experiments.comparison import (
+    LearnerSettings,
+    compare,
+    last_regrets,
+    learning_panels,
+    make_contender,
+    p_value,
+    postures,
+)
 from experiments.errors import UserError
-from experiments.learning import Plan, Session
+from experiments.learning import Session
 from experiments.registry import Claim
 
 LOW, HIGH = 1.4, 2.0
@@ -25,28 +33,15 @@ SHOWN_RBF = "rbf6"
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """Settings of the experiment; the paper gives samples, archive, KL bound and numbers of RBFs.
+class Settings(LearnerSettings):
+    """Settings of the experiment; the unit of parameters, and so of `start_std`, is rad.
 
     Attributes:
-        iterations: iterations of learning.
-        trials: trials of each curve; the paper has 5.
-        samples: N, new samples of an iteration.
-        archive_size: L, samples kept.
-        kl_bound: epsilon, nats.
-        num_centers: the numbers K of RBFs.
-        ridge: relative penalty on the policy's coefficients.
-        start_std: standard deviation of the first policy, whose mean is zero, rad.
+        num_centers: the numbers K of RBFs; the paper tries 2 to 20.
     """
 
-    iterations: int = 1000
-    trials: int = 20
-    samples: int = 40
-    archive_size: int = 2000
-    kl_bound: float = 0.5
-    num_centers: tuple[int, ...] = (2, 4, 6, 10, 20)
-    ridge: float = 1e-4
     start_std: float = 0.5
+    num_centers: tuple[int, ...] = (2, 4, 6, 10, 20)
 
     def __post_init__(self) -> None:
         if 6 not in self.num_centers:
@@ -68,9 +63,8 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         rbf = rbf_features(LOW, HIGH, num)
         features[f"rbf{num}"] = (rbf, rbf)
     contenders = {name: make_contender(task, pair, settings) for name, pair in features.items()}
-    plan = Plan(settings.iterations, settings.samples)
     grid = context_grid(LOW, HIGH, 25)
-    arrays = compare(contenders, plan, key, trials=settings.trials, grid=grid, session=session)
+    arrays = compare(contenders, settings, key, grid=grid, session=session)
     for name in ("linear", SHOWN_RBF):
         arrays[f"{name}.postures"] = postures(
             contenders[name],
@@ -83,10 +77,12 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
 
 def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     """Draw Fig. 8a and 8b, the last regrets, and the arm's postures (Fig. 9)."""
-    names = _names(arrays)
+    labels = {
+        name: "linear" if name == "linear" else f"{name.removeprefix('rbf')} RBFs" for name in _names(arrays)
+    }
     panels = {
         "Linear and RBF policies": ("linear", SHOWN_RBF),
-        "Number of RBFs": [name for name in names if name != "linear"],
+        "Number of RBFs": [name for name in labels if name != "linear"],
     }
     figure, axes = plots.new_figure(2, len(SHOWN), width=8.0, height=8.0)
     for row, name in enumerate(("linear", SHOWN_RBF)):
@@ -95,27 +91,16 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
             plots.plot_ground(axes[row, column], center, WIDTH, DEPTH)
             nearest = np.abs(arrays["context"][:, 0] - center).argmin()
             reward = arrays[f"{name}.grid_reward"][0, -1, nearest]
-            axes[row, column].set_title(f"{_label(name)}: hole at {center:g} m, reward {reward:,.0f}")
+            axes[row, column].set_title(f"{labels[name]}: hole at {center:g} m, reward {reward:,.0f}")
     return {
-        "learning_curve": plots.learning_curves(
-            {
-                title: {_label(name): mean_policy_curve(arrays, name) for name in some}
-                for title, some in panels.items()
-            }
-        ),
-        "final": plots.final_values(
-            {_label(name): regret(arrays, name) for name in names}, label="regret over the grid", log=True
-        ),
+        "learning_curve": plots.learning_curves(learning_panels(arrays, panels, labels)),
+        "final": plots.final_values(last_regrets(arrays, labels), label="regret over the grid", log=True),
         "postures": figure,
     }
 
 
 def _names(arrays: Mapping[str, np.ndarray]) -> list[str]:
     return [key.removesuffix(".coef") for key in arrays if key.endswith(".coef")]
-
-
-def _label(name: str) -> str:
-    return "linear" if name == "linear" else f"{name.removeprefix('rbf')} RBFs"
 
 
 def _num_better(arrays: Mapping[str, np.ndarray]) -> float:

@@ -189,7 +189,7 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
         ),
         duration=settings.duration if duration is None else duration,
         start_up=START_UP,
-        noise=WalkNoise(*(noise * size for size in WalkNoise())),
+        noise=WalkNoise().times(noise),
         balance=settings.balance(),
     )
     return sigmoid_constrained(task, *BOUNDS[settings.bounds])

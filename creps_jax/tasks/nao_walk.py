@@ -47,6 +47,10 @@ class WalkNoise(NamedTuple):
     set_point: float = 0.01
     start: float = 0.01
 
+    def times(self, factor: float) -> "WalkNoise":
+        """Return so many times this noise."""
+        return WalkNoise(*(factor * size for size in self))
+
 
 class WalkOutcome(NamedTuple):
     """What a walk brings.

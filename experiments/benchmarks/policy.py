@@ -47,7 +47,7 @@ def main(
         balance = balance._replace(placement_gain=placement_gain)
     speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
     thetas = jnp.stack([jnp.asarray(saved.theta(float(speed))) for speed in speeds])
-    task = nao_walk(balance=balance, noise=WalkNoise(*(noise * size for size in WalkNoise())))
+    task = nao_walk(balance=balance, noise=WalkNoise().times(noise))
     outcome = evaluate(jax.random.key(2026), task, jnp.asarray(speeds)[:, None], thetas, repeats=SEEDS)
     reward, speed, fell = (np.asarray(field) for field in (outcome.reward, outcome.speed, outcome.fell))
     print(tables.to_markdown(tables.speed_table(speeds, reward, speed, fell)))

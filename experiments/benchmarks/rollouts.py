@@ -22,16 +22,16 @@ import mujoco  # noqa: E402
 import mujoco.rollout  # noqa: E402
 import numpy as np  # noqa: E402
 
-from creps_jax.motion.walking.posture import Balance  # noqa: E402
 from creps_jax.tasks.nao_walk import CONTROL_PERIOD, load_nao, nao_walk, record_walk  # noqa: E402
 from creps_jax.train import evaluate  # noqa: E402
+from experiments.walk import SETTINGS  # noqa: E402
 
 BATCH = 96
 DURATION = 2.0
 ROUNDS = 5
 # A gait of about .33 m/s.
 THETA = (0.001, 0.176, 0.039, 0.224, 3.2, 0.46, 0.31, 0.074, 0.038, 0.11)
-BALANCE = Balance(heading_gain=0.3, placement_gain=0.6)
+BALANCE = SETTINGS["best"].balance()
 
 
 def main() -> None:
