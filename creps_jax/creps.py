@@ -148,7 +148,8 @@ def creps(
         features = jax.vmap(policy_features.apply)(contexts)
         return jax.vmap(gaussian.mean, (None, 0))(policy, features)
 
-    return Creps(init, ask, tell, mean)
+    # Compiled here, as ask and tell are called by hand where a robot is real.
+    return Creps(init, jax.jit(ask), jax.jit(tell), jax.jit(mean))
 
 
 def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array, is_valid: Array) -> Scalar:

@@ -16,7 +16,7 @@ from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
 __all__ = ["DualSolution", "dual_objective", "sample_kl", "sample_weights", "solve_dual"]
 
 _NUM_ROUNDS = 4
-"""Rounds of standardising and minimising; later ones take a step or none where the first was enough."""
+"""Most rounds of standardising and minimising, before and after the bound may be given up."""
 _RESOLUTION = 5e-6
 """Lowest temperature, as a share of the numbers whose difference is the advantage: what float32 can order."""
 _LEAST_SPREAD = 3e-4
@@ -66,7 +66,18 @@ def dual_objective(
 
     Source: Abdolmaleki et al. 2016, Eq. 13.
     """
-    reward, features, counts = _mask(reward, features, valid)
+    return _dual(log_temperature, baseline_coef, *_mask(reward, features, valid), kl_bound)
+
+
+def _dual(
+    log_temperature: ScalarLike,
+    baseline_coef: Array,
+    reward: Array,
+    features: Array,
+    counts: Array,
+    kl_bound: ScalarLike,
+) -> Scalar:
+    """Evaluate the dual function on what `_mask` returns."""
     num_samples = jnp.sum(counts, dtype=reward.dtype)
     temperature = jnp.exp(log_temperature)
     mean_features = jnp.sum(features, axis=0) / num_samples
@@ -195,7 +206,9 @@ class _Guess(NamedTuple):
     temperature: Array
     baseline_coef: Array
     floor: Array  # of the temperature
+    kl: Array  # of the weights
     is_active: Array
+    is_settled: Array  # whether another round would find nothing to do
     num_steps: Array
 
 
@@ -209,12 +222,19 @@ def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
     temperature = jnp.sqrt(jnp.sum(residual**2) / (2.0 * num_samples * kl_bound))
     mean_size = -jnp.sum(samples.reward) / num_samples
     floor = _RESOLUTION * jnp.where(mean_size > 0, mean_size, 1.0)
-    no_steps = jnp.zeros((), jnp.int32)
-    return _Guess(jnp.maximum(temperature, 2.0 * floor), coef, floor, jnp.ones((), bool), no_steps)
+    return _Guess(
+        temperature=jnp.maximum(temperature, 2.0 * floor),
+        baseline_coef=coef,
+        floor=floor,
+        kl=jnp.zeros_like(floor),
+        is_active=jnp.ones((), bool),
+        is_settled=jnp.zeros((), bool),
+        num_steps=jnp.zeros((), jnp.int32),
+    )
 
 
 def _search(samples: _Samples, kl_bound: Array) -> _Guess:
-    """Improve a first guess in a fixed number of rounds; midway, give up a bound that is out of reach.
+    """Improve a first guess, round by round; midway, give up a bound that is out of reach.
 
     One round is enough for well-behaved rewards. Where some are far worse than the others (falls), the scale
     and the baseline of all rewards say little of those that end up with a weight: each round takes both from
@@ -222,18 +242,26 @@ def _search(samples: _Samples, kl_bound: Array) -> _Guess:
     """
     first = _first_guess(samples, kl_bound)
 
-    def improve(carry: tuple[_Guess, Array], is_midway: Array) -> tuple[tuple[_Guess, Array], None]:
-        guess, bound = carry
-        kl = sample_kl(_weigh(guess, samples), samples.counts)
-        is_out_of_reach = is_midway & ((guess.temperature <= 1.1 * guess.floor) | (kl < 0.999 * kl_bound))
-        # Rounding decides among greedy weights: start again, and stop a little short of them.
-        bound = jnp.where(is_out_of_reach, _NEARLY_GREEDY * kl, bound)
-        restart = first._replace(is_active=jnp.zeros((), bool), num_steps=guess.num_steps)
-        guess = jax.tree.map(lambda new, old: jnp.where(is_out_of_reach, new, old), restart, guess)
-        return (_improve(guess, samples, bound), bound), None
+    def is_going_on(search: tuple[_Guess, Array, Array]) -> Array:
+        guess, _, num_rounds = search
+        return (num_rounds < 2 * _NUM_ROUNDS) & ~guess.is_settled
 
-    is_midway = jnp.arange(2 * _NUM_ROUNDS) == _NUM_ROUNDS
-    return lax.scan(improve, (first, kl_bound), is_midway)[0][0]
+    def improve(search: tuple[_Guess, Array, Array]) -> tuple[_Guess, Array, Array]:
+        guess, bound, num_rounds = search
+        # Rounding decides among greedy weights: start again, and stop a little short of them.
+        is_given_up = (num_rounds == _NUM_ROUNDS) & _misses(guess, kl_bound)
+        bound = jnp.where(is_given_up, _NEARLY_GREEDY * guess.kl, bound)
+        restart = first._replace(is_active=jnp.zeros((), bool), num_steps=guess.num_steps)
+        guess = jax.tree.map(lambda new, old: jnp.where(is_given_up, new, old), restart, guess)
+        return _improve(guess, samples, bound), bound, num_rounds + 1
+
+    start = (first, kl_bound, jnp.zeros((), jnp.int32))
+    return lax.while_loop(is_going_on, improve, start)[0]
+
+
+def _misses(guess: _Guess, kl_bound: Array) -> Array:
+    """Say whether the weights fall short of the bound, as they do where no temperature reaches it."""
+    return (guess.temperature <= 1.1 * guess.floor) | (guess.kl < 0.999 * kl_bound)
 
 
 def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
@@ -249,20 +277,23 @@ def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
 
     def objective(variables: Array) -> Array:
         log_temperature, coef = jnp.log(temperature_of(variables[0])), variables[1:]
-        return dual_objective(log_temperature, coef, residual, samples.whitened, samples.counts, kl_bound)
+        return _dual(log_temperature, coef, residual, samples.whitened, samples.counts, kl_bound)
 
     start = jnp.zeros(1 + samples.whitened.shape[1], residual.dtype)
     # In units of the temperature: weights change by factors up to e^10 times the whitened features.
     max_change = jnp.full_like(start, 10.0).at[0].set(2.0)
     minimum = minimise(objective, start, max_steps=40, max_change=max_change)
-    temperature = unit * temperature_of(minimum.point[0])
-    return _Guess(
-        temperature=temperature,
+    change = temperature_of(minimum.point[0])
+    improved = guess._replace(
+        temperature=unit * change,
         baseline_coef=guess.baseline_coef + unit * exact_dot(samples.whitening, minimum.point[1:]),
         floor=floor,
-        is_active=guess.is_active,
         num_steps=guess.num_steps + minimum.num_steps,
     )
+    improved = improved._replace(kl=sample_kl(_weigh(improved, samples), samples.counts))
+    # Was the unit about right, then another round would be this one over again.
+    is_settled = minimum.is_converged & (jnp.abs(jnp.log(change)) < 0.7) & ~_misses(improved, kl_bound)
+    return improved._replace(is_settled=is_settled)
 
 
 def _temperature_floor(guess: _Guess, samples: _Samples) -> Array:

@@ -11,7 +11,7 @@ from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
 
 __all__ = ["Minimum", "minimise"]
 
-_NUM_TRIALS = 12
+_NUM_TRIALS = 6
 """Step lengths tried at once: 1, 1/2, ..., 1/2048 of the Newton step."""
 _FLAT = 1e-6
 """Least curvature of an axis, as a share of the largest: what float32 tells from rounding."""
@@ -112,7 +112,7 @@ def _line_search(
     value_and_grad: Callable[[Array], tuple[Array, Array]], search: _Search, step: Array
 ) -> _Search:
     """Move along the step by the longest trial length that is as good as the best one, to rounding."""
-    lengths = 0.5 ** jnp.arange(_NUM_TRIALS, dtype=step.dtype)
+    lengths = 0.25 ** jnp.arange(_NUM_TRIALS, dtype=step.dtype)
     points = search.point[None, :] + lengths[:, None] * step[None, :]
     values, grads = jax.vmap(value_and_grad)(points)
     slope, slopes = jnp.sum(search.grad * step), jnp.sum(grads * step[None, :], axis=1)
