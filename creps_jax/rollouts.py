@@ -13,7 +13,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from creps_jax.tasks.base import Task
 from creps_jax.typing import Array, Bool, Float, PRNGKey
 
-__all__ = ["Devices", "device_tuple", "mean_outcome", "replicate", "roll_out"]
+__all__ = ["Devices", "device_tuple", "mean_outcome", "replicate", "roll_out", "share_rows", "spread_rows"]
 
 Devices = Sequence[jax.Device] | None
 """Devices that share the rollouts; None stands for all local ones."""
@@ -78,6 +78,11 @@ def replicate(tree: Any, devices: tuple[jax.Device, ...]) -> Any:
     return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec()))
 
 
+def spread_rows(tree: Any, devices: tuple[jax.Device, ...]) -> Any:
+    """Put the rows of arrays on the devices to which `share_rows` gives them."""
+    return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec("rows")))
+
+
 def mean_outcome(outcomes: Any, is_counted: Bool[Array, " n"]) -> Any:
     """Average each field (n, ...) of outcomes over the rollouts that count; NaN if none does."""
 
@@ -88,16 +93,20 @@ def mean_outcome(outcomes: Any, is_counted: Bool[Array, " n"]) -> Any:
     return jax.tree.map(mean, outcomes)
 
 
+def share_rows(function: Callable, devices: tuple[jax.Device, ...]) -> Callable:
+    """Share the rows of a function's arguments out over devices, which have to divide their number."""
+    rows = PartitionSpec("rows")
+    # Unchecked, so that a rollout may start its loops from constants, as it may on one device.
+    return jax.shard_map(function, mesh=_mesh(devices), in_specs=rows, out_specs=rows, check_vma=False)
+
+
 def _mesh(devices: tuple[jax.Device, ...]) -> Mesh:
-    return Mesh(np.asarray(devices), ("rollouts",))
+    return Mesh(np.asarray(devices), ("rows",))
 
 
 def _shared_out(function: Callable, devices: tuple[jax.Device, ...]) -> Callable:
-    """Share the rows of a batch out over devices; the last row fills up what does not divide."""
-    mesh = _mesh(devices)
-    rows = PartitionSpec("rollouts")
-    # Unchecked, so that a rollout may start its loops from constants, as it may on one device.
-    sharded = jax.shard_map(function, mesh=mesh, in_specs=rows, out_specs=rows, check_vma=False)
+    """Share a batch out over devices; the last row fills up what does not divide."""
+    sharded = share_rows(function, devices)
 
     def shared_out(*batch: Array) -> Any:
         num = batch[0].shape[0]
@@ -105,7 +114,7 @@ def _shared_out(function: Callable, devices: tuple[jax.Device, ...]) -> Callable
         index = jnp.minimum(jnp.arange(padded), num - 1)
         results = sharded(*(x[index] for x in batch))
         # Every device goes on with all results: the update is small, and equal on each of them.
-        results = lax.with_sharding_constraint(results, NamedSharding(mesh, PartitionSpec()))
+        results = lax.with_sharding_constraint(results, NamedSharding(_mesh(devices), PartitionSpec()))
         return jax.tree.map(lambda x: x[:num], results)
 
     return shared_out

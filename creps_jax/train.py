@@ -17,7 +17,15 @@ from jaxtyping import Key, UInt32
 from creps_jax.archive import Batch
 from creps_jax.creps import Creps, CrepsInfo, CrepsState
 from creps_jax.policy import LinearGaussian
-from creps_jax.rollouts import Devices, device_tuple, mean_outcome, replicate, roll_out
+from creps_jax.rollouts import (
+    Devices,
+    device_tuple,
+    mean_outcome,
+    replicate,
+    roll_out,
+    share_rows,
+    spread_rows,
+)
 from creps_jax.tasks.base import Task
 from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
 
@@ -100,6 +108,7 @@ def train(
     """
     state = start if isinstance(start, CrepsState) else algorithm.init(start)
     phases = _phases(task, algorithm, state, iterations, samples, first_samples, devices)
+    state = replicate(state, phases[0][0].devices)
     state, logs = _run(_iterate, phases, key, state, on_iteration)
     return state, jax.tree.map(jnp.asarray, logs)
 
@@ -116,7 +125,9 @@ def train_trials(
     on_iteration: OnIteration | None = None,
     devices: Devices = None,
 ) -> tuple[CrepsState, IterationLog]:
-    """Run several trials of `train` at once; the rollouts of all of them are one batch.
+    """Run several trials of `train` at once.
+
+    Devices share the trials where these divide by their number, and otherwise the rollouts of all of them.
 
     Args:
         keys: Key of each trial.
@@ -127,7 +138,8 @@ def train_trials(
         samples: Number of new samples of each iteration of each trial.
         first_samples: Number of new samples of the very first iteration, if it differs.
         on_iteration: As in `train`; state and log have a first axis of trials.
-        devices: Devices that share the rollouts, by default all local ones.
+        devices: Devices that share the work, by default all local ones. Nothing that is drawn
+            depends on them.
 
     Returns:
         The last states (trials, ...), and the logs (trials, iterations, ...).
@@ -144,6 +156,9 @@ def train_trials(
     if states.iteration.shape != (num_trials,):
         raise ValueError(f"one state is needed for each of {num_trials} keys, got {states.iteration.shape}")
     phases = _phases(task, algorithm, states, iterations, samples, first_samples, devices)
+    setup = phases[0][0]
+    place = spread_rows if _shares_trials(setup, num_trials) else replicate
+    keys, states = place((keys, states), setup.devices)
     states, logs = _run(_iterate_trials, phases, keys, states, on_iteration)
     return states, jax.tree.map(lambda x: jnp.asarray(np.swapaxes(x, 0, 1)), logs)
 
@@ -227,7 +242,15 @@ def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState
 
 @partial(jax.jit, static_argnums=0)
 def _iterate_trials(setup: _Setup, keys: Array, states: CrepsState) -> tuple[CrepsState, IterationLog]:
-    return jax.vmap(partial(_iterate, setup))(keys, states)
+    if not _shares_trials(setup, keys.shape[0]):
+        return jax.vmap(partial(_iterate, setup))(keys, states)
+    alone = setup._replace(devices=setup.devices[:1])
+    return share_rows(jax.vmap(partial(_iterate, alone)), setup.devices)(keys, states)
+
+
+def _shares_trials(setup: _Setup, num_trials: int) -> bool:
+    """Say whether devices share trials, which beats sharing rollouts: updates are shared as well."""
+    return len(setup.devices) > 1 and num_trials % len(setup.devices) == 0
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
@@ -265,7 +288,7 @@ def _run(
     on_iteration: OnIteration | None,
 ) -> tuple[CrepsState, IterationLog]:
     """Run all phases, as scans or as loops; return the logs on the host, stacked along a first axis."""
-    state, logs = replicate(state, phases[0][0].devices), []
+    logs = []
     for setup, length in phases:
         if on_iteration is None and length > 1:
             state, log = _scan(iterate, setup, length, key, state)

@@ -90,8 +90,9 @@ def compare(
         mean policies were judged; and for each NAME: `NAME.sample_reward` and `NAME.kl` (trials, iterations),
         `NAME.grid_reward` (trials, evaluated, n), `NAME.coef` (trials, p, d), the last policies'.
     """
-    # Rollouts as short as these are not worth sharing out.
-    devices = jax.local_devices()[:1]
+    # Rollouts as short as these are not worth sharing out, trials are.
+    devices = jax.local_devices()
+    devices = devices if settings.trials % len(devices) == 0 else devices[:1]
     plan = Plan(settings.iterations, settings.samples)
     learn_key, evaluate_key = jax.random.split(key)
     evaluated = np.unique(np.linspace(1, plan.iterations, NUM_EVALUATED).round().astype(int))

@@ -147,7 +147,7 @@ def test_rollouts_run_on_all_devices():
 
     def rollout(key, context, theta):
         # Runs on the host, once for each device's share.
-        jax.debug.callback(lambda i: placed.setdefault(int(i), 0), jax.lax.axis_index("rollouts"))
+        jax.debug.callback(lambda i: placed.setdefault(int(i), 0), jax.lax.axis_index("rows"))
         return TASK.rollout(key, context, theta)
 
     task = Task(TASK.sample_context, rollout, 1, 2, -50)
@@ -216,6 +216,22 @@ def test_trials_may_be_watched_and_have_more_samples_first(key):
     assert_equal(looped, train_trials(keys, TASK, QUICK, POLICY, **settings))
     np.testing.assert_array_equal(np.stack(seen, axis=1), looped[1].mean_reward)
     np.testing.assert_array_equal(looped[0].archive.size, [16, 16, 16])
+
+
+def test_trials_shared_out_over_devices_stay_where_they_are(key):
+    keys, settings = jax.random.split(key, 4), {"samples": SAMPLES, "iterations": 3}
+    with count_compilations() as compilations:
+        counts = []
+
+        def watch(state, log):
+            counts.append(len(compilations))
+
+        states, _ = train_trials(keys, TASK, QUICK, POLICY, on_iteration=watch, **settings)
+    assert {shard.data.shape[0] for shard in states.iteration.addressable_shards} == {2}
+    # What an iteration finds is where the last one left it: nothing is compiled anew.
+    assert counts[0] == counts[-1]
+    alone, _ = train_trials(keys, TASK, QUICK, POLICY, devices=jax.devices()[:1], **settings)
+    assert_close(states, alone)
 
 
 def test_an_iteration_can_be_vmapped_and_jitted(key):

@@ -214,6 +214,19 @@ def test_hips_stand_at_the_asked_height_above_the_ankles():
     np.testing.assert_allclose(height, 0.176, atol=1e-5)
 
 
+def test_planted_feet_are_not_turned_in_double_support():
+    params = params_from_theta(jnp.array([0.0, 0.17, 0.04, 0.4, 0.0, 0.3, 0.3, 0.05, 0.1, 0.1]))
+    plan = plan_walk(params, NUM_STEPS)
+
+    def turn_at(steps):
+        return pose_at(params, plan, jnp.float32(steps) * params.step_duration).turn
+
+    # A quarter of the step has both feet on the ground, half of it at each end.
+    np.testing.assert_allclose(turn_at(2.12), turn_at(1.88), atol=1e-6)
+    assert abs(turn_at(2.12)) == pytest.approx(0.5)
+    assert abs(turn_at(2.5)) < 1e-5
+
+
 def test_heading_hold_turns_the_feet_back_and_is_off_by_default():
     params = params_from_theta(THETA)
     plan = plan_walk(params, NUM_STEPS)

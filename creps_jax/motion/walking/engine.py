@@ -152,7 +152,7 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
     remainder = node - index.astype(node.dtype)
     com = (1.0 - remainder) * plan.com[index] + remainder * plan.com[index + 1]
     height, _ = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
-    turned = smooth_step(phase)
+    turned, swung = smooth_step(phase), smooth_step(jnp.clip(swing_phase, 0.0, 1.0))
     yaw = (1.0 - turned) * plan.yaw[0] + turned * plan.yaw[1]
     forward = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
     hips = com - _COM_AHEAD_OF_HIP * forward
@@ -161,7 +161,7 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
         hips=jnp.concatenate([hips, jnp.stack([height + GEOMETRY.ankle_height, yaw])]),
         left=jnp.where(supports_left, support, swing),
         right=jnp.where(supports_left, swing, support),
-        turn=jnp.where(supports_left, 0.5 - turned, turned - 0.5),
+        turn=jnp.where(supports_left, 0.5 - swung, swung - 0.5),
     )
 
 
