@@ -12,6 +12,7 @@ from creps_jax import tasks
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks import Outcome, average_repeats, penalised, sigmoid_constrained, sinus
+from creps_jax.tasks.functions import sphere
 
 FEATURE_MAPS = {
     "linear": lambda: linear_features(2),
@@ -31,6 +32,7 @@ TASKS = {
     "sinus penalised": lambda: penalised(sinus(), -1.0, 1.0, 10.0),
     "via_point_reaching": lambda: tasks.via_point_reaching(),
     "hole_reaching": lambda: tasks.hole_reaching(),
+    "contextual_function": lambda: tasks.contextual_function(sphere, jnp.ones((4, 2))),
     "nao_walk": lambda: tasks.nao_walk(),
 }
 # A rollout of these takes long to compile: only its shapes and types are looked at.

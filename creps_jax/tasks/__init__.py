@@ -16,6 +16,7 @@ from creps_jax.tasks.base import (
     penalised,
     sigmoid_constrained,
 )
+from creps_jax.tasks.functions import contextual_function
 from creps_jax.tasks.planar_arm import hole_reaching, via_point_reaching
 from creps_jax.tasks.sinus import sinus
 
@@ -27,6 +28,7 @@ __all__ = [
     "PlainOutcome",
     "Task",
     "average_repeats",
+    "contextual_function",
     "hole_reaching",
     "nao_walk",
     "penalised",
