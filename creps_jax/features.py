@@ -21,6 +21,9 @@ class FeatureMap(NamedTuple):
     apply: Callable[[Float[Array, " s"]], Float[Array, " m"]]
     size: int
     context_dim: int
+    scale: tuple[float, ...] | None = None
+    """How large each feature can get, which penalties on its coefficients are relative to; None where it has
+    a unit, and its size on the samples has to do."""
 
 
 def linear_features(dim: int) -> FeatureMap:
@@ -113,7 +116,7 @@ def rbf_features(
         log_weights = -jnp.sum(0.5 * inside**2 + outside[None, :] * inside, axis=1)
         return jax.nn.softmax(log_weights)
 
-    return FeatureMap(apply, centers.shape[0], dim)
+    return FeatureMap(apply, centers.shape[0], dim, scale=(1.0,) * centers.shape[0])
 
 
 def _rbf_settings(

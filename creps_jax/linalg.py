@@ -1,5 +1,6 @@
 """Solve the small linear systems of the library: tridiagonal, regression, Cholesky, whitening."""
 
+import math
 from typing import TypeAlias
 
 import jax
@@ -85,12 +86,14 @@ def weighted_ridge(
     weights: Float[Array, " n"],
     *,
     ridge: ScalarLike,
+    scale: Float[Array, " p"] | None = None,
+    free: Float[Array, " p"] | None = None,
 ) -> Float[Array, "p d"]:
     """Fit targets by a linear function of features under a ridge relative to the size of each feature.
 
-    Minimises `sum_i d_i |y_i - B' x_i|^2 / sum_i d_i + ridge sum_j q_j |B_j|^2`, where q_j is the weighted
-    mean square of feature j, so that the fit does not depend on the units of features or targets. An
-    orthogonal factorisation bears features on a large offset, which normal equations in float32 do not.
+    Minimises `sum_i d_i |y_i - B' x_i|^2 / sum_i d_i + ridge sum_j q_j |B_j|^2`, where q_j is the square of
+    feature j's scale, so that the fit does not depend on the units of features or targets. An orthogonal
+    factorisation bears features on a large offset, which normal equations in float32 do not.
 
     Args:
         features: Features x, one row a sample.
@@ -98,6 +101,9 @@ def weighted_ridge(
         weights: Weights d of the samples, not negative; a sample of weight zero may hold anything.
         ridge: Strength of the penalty, not negative. Zero is raised to the resolution of the format, which
             keeps the fit finite with collinear features or fewer samples than features.
+        scale: Size of each feature, above zero; by default the root of its weighted mean square. A feature
+            that is nearly zero on all samples is then hardly penalised: where it can be large, say so.
+        free: Coefficients whose multiples are not penalised, those of an intercept; by default all are.
 
     Returns:
         The coefficients B.
@@ -119,10 +125,15 @@ def weighted_ridge(
     root = jnp.sqrt(jnp.where(is_weighted, weights[:, None], 0.0) / jnp.where(total > 0, total, 1.0))
     rows = root * jnp.where(is_weighted, features, 0.0)
     values = root * jnp.where(is_weighted, targets, 0.0)
-    size = jnp.linalg.norm(rows, axis=0)
+    size = jnp.linalg.norm(rows, axis=0) if scale is None else scale
     size = jnp.asarray(jnp.where(size > 0, size, 1.0))
-    damping = jnp.sqrt(jnp.maximum(jnp.asarray(ridge, features.dtype), num_features * (4.0 * eps) ** 2))
-    penalty = damping * jnp.eye(num_features, dtype=features.dtype)
+    damping, least = jnp.sqrt(jnp.asarray(ridge, features.dtype)), math.sqrt(num_features) * 4.0 * eps
+    penalty = jnp.eye(num_features, dtype=features.dtype)
+    if free is not None:
+        free = free * size
+        square = jnp.sum(free**2)
+        penalty = penalty - free[:, None] * free[None, :] / jnp.where(square > 0, square, 1.0)
+    penalty = damping * penalty + least * jnp.eye(num_features, dtype=features.dtype)
     orthogonal, triangular = jnp.linalg.qr(jnp.concatenate([rows / size[None, :], penalty]))
     projected = exact_dot(orthogonal[:num_samples].T, values)
     return jax.scipy.linalg.solve_triangular(triangular, projected) / size[:, None]

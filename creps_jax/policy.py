@@ -14,6 +14,8 @@ from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike
 __all__ = ["LinearGaussian", "entropy", "fit_weighted_ml", "kl", "log_prob", "mean", "sample"]
 
 _LOG_TWO_PI = 1.8378770664093453
+_ROUNDING = 3e-6
+"""Spread of a feature, as a share of its size, that may be rounding."""
 
 
 class LinearGaussian(NamedTuple):
@@ -120,17 +122,21 @@ def fit_weighted_ml(
     weights: Float[Array, " n"],
     *,
     ridge: ScalarLike,
+    scale: Float[Array, " p"] | None = None,
 ) -> LinearGaussian:
     """Fit the policy to weighted samples by maximum likelihood.
 
     Parameters may have very different units: each is fitted on its own scale. The ridge shrinks the policy
-    towards the weighted mean of theta (as far as the features can express a constant), not towards zero.
+    towards the weighted mean of theta (as far as the features can express a constant), not towards zero: it
+    penalises how the mean changes with the context, from whatever zero the context is measured.
 
     Args:
         features: Policy features varphi of the context of each sample.
         theta: Parameters of each sample.
         weights: Weights d of the samples, not negative; a sample of weight zero may hold anything.
-        ridge: Penalty on the coefficients, relative to the mean square of each feature; may be zero.
+        ridge: Penalty on the coefficients, but for those that make a constant, relative to the square of
+            each feature's scale; may be zero.
+        scale: Size of each feature, see `weighted_ridge`; by default its standard deviation.
 
     Returns:
         The policy. Its covariance is taken about its own, context-dependent mean; it is finite and positive
@@ -156,10 +162,20 @@ def fit_weighted_ml(
     ones = jnp.ones((theta.shape[0], 1), theta.dtype)
     constant = weighted_ridge(features, ones, weights, ridge=0.0)  # the features' nearest to a constant
     rest = (theta - centre[None, :]) + (ones - exact_dot(features, constant)) * centre[None, :]
-    slope = weighted_ridge(features, rest, weights, ridge=ridge)  # Eq. (14)
+    if scale is None:
+        scale = _spread(features, weights)
+    slope = weighted_ridge(features, rest, weights, ridge=ridge, scale=scale, free=constant[:, 0])  # Eq. (14)
     residual = jnp.where(is_weighted[:, None], rest - exact_dot(features, slope), 0.0)
     cov_chol = _weighted_cov_chol(residual, weights, jnp.max(jnp.abs(theta), axis=0))
     return LinearGaussian(constant * centre[None, :] + slope, cov_chol)
+
+
+def _spread(features: Float[Array, "n p"], weights: Float[Array, " n"]) -> Float[Array, " p"]:
+    """Return the weighted standard deviation of features; of one that is constant, to rounding, its size."""
+    size = jnp.sqrt(exact_dot(weights, features**2))
+    centred = features - exact_dot(weights, features)[None, :]
+    spread = jnp.sqrt(exact_dot(weights, centred**2))
+    return jnp.where(spread > _ROUNDING * size, spread, size)
 
 
 def _weighted_cov_chol(

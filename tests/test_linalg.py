@@ -103,6 +103,24 @@ def test_weighted_ridge_ignores_samples_without_weight():
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
+def test_weighted_ridge_leaves_the_free_direction_unpenalised():
+    rng = np.random.default_rng(8)
+    features, targets = jnp.float32(rng.normal(size=(50, 3)) + 1.0), jnp.float32(rng.normal(size=(50, 2)))
+    free = jnp.array([1.0, -2.0, 0.5])
+    found = weighted_ridge(features, targets, jnp.ones(50), ridge=1e6, free=free)
+    along = np.asarray(features @ free)
+    best = along @ np.asarray(targets) / (along @ along)
+    np.testing.assert_allclose(found, np.outer(free, best), rtol=1e-3, atol=1e-4)
+
+
+def test_weighted_ridge_holds_a_feature_that_could_be_large_but_is_not():
+    features = jnp.ones((50, 2)).at[:, 1].set(1e-4 * jnp.arange(50) / 50)
+    targets = features[:, 1:] * 1e4
+    wild = weighted_ridge(features, targets, jnp.ones(50), ridge=1e-4)
+    held = weighted_ridge(features, targets, jnp.ones(50), ridge=1e-4, scale=jnp.ones(2))
+    assert wild[1, 0] > 5e3 and jnp.abs(held[1, 0]) < 1.0
+
+
 @pytest.mark.parametrize("num_weighted", [0, 1, 2])
 def test_weighted_ridge_on_fewer_samples_than_features_fits_them(num_weighted):
     rng = np.random.default_rng(6)

@@ -144,6 +144,27 @@ def test_ridge_shrinks_towards_the_weighted_mean():
     np.testing.assert_allclose(features @ found.coef, np.broadcast_to(centre, theta.shape), rtol=1e-3)
 
 
+def test_a_policy_is_not_wild_where_there_were_no_contexts(key):
+    rbf = rbf_features(0.0, 1.0, 20)
+    contexts = jnp.clip(0.5 + 0.1 * jax.random.normal(key, (40, 1)), 0.0, 1.0)
+    features = jax.vmap(rbf.apply)(contexts)
+    theta = contexts + 0.1 * jax.random.normal(jax.random.key(1), (40, 1))
+    found = fit(features, theta, jnp.ones(40), ridge=1e-4, scale=jnp.asarray(rbf.scale))
+    everywhere = jax.vmap(rbf.apply)(jnp.linspace(0.0, 1.0, 101)[:, None]) @ found.coef
+    assert everywhere.min() > -0.5 and everywhere.max() < 1.5
+
+
+@pytest.mark.parametrize("shift", [0.0, 100.0])
+def test_ridge_does_not_care_for_the_zero_of_the_context(shift, key):
+    contexts = jax.random.uniform(key, (200, 1))
+    theta = 3.0 * contexts + 0.1 * jax.random.normal(jax.random.key(1), (200, 1))
+    features = jnp.concatenate([jnp.ones((200, 1)), contexts + shift], axis=1)
+    found = fit(features, theta, jnp.ones(200), ridge=0.5)
+    # A ridge of half the variance takes away a third of the slope.
+    assert found.coef[1, 0] == pytest.approx(2.0, rel=0.02)
+    np.testing.assert_allclose(jnp.mean(features @ found.coef), theta.mean(), atol=2e-3)
+
+
 def test_samples_without_weight_may_hold_anything():
     features, theta, weights = data()
     hidden = np.arange(300) % 3 == 0
