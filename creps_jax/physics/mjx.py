@@ -1,56 +1,21 @@
 """Step a robot with position servos by MJX, one control step at a time."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jax import lax
 from jax.scipy.linalg import cho_factor, cho_solve
 from mujoco import mjx
 
+from creps_jax.physics.servos import Servos, read_servos
+from creps_jax.physics.state import ControlStep, RobotState
 from creps_jax.typing import Array, Float
 
-__all__ = ["ControlStep", "RobotState", "initial_state", "make_control_step"]
+__all__ = ["make_control_step"]
 
 _POSITION_STAGES = (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.collision, mjx.make_constraint)
 _VELOCITY_STAGES = (mjx.com_vel, mjx.passive, mjx.rne)
-
-
-class RobotState(NamedTuple):
-    """All that MuJoCo carries from one step to the next.
-
-    Attributes:
-        qpos: Generalised positions (free joint first: position, wxyz quaternion), m and rad.
-        qvel: Generalised velocities, m/s and rad/s.
-        qacc_warmstart: Acceleration from which the contact solver starts.
-    """
-
-    qpos: Float[Array, " nq"]
-    qvel: Float[Array, " nv"]
-    qacc_warmstart: Float[Array, " nv"]
-
-
-ControlStep = Callable[[RobotState, Array, Array, Array], RobotState]
-"""(state, set-points before, set-points after, their speeds) -> state one control step later."""
-
-
-class _Servos(NamedTuple):
-    """The position servos of a robot, each on a joint with one degree of freedom."""
-
-    stiffness: np.ndarray
-    damping: np.ndarray
-    control_range: np.ndarray
-    torque_range: np.ndarray
-    qpos_index: np.ndarray
-    qvel_index: np.ndarray
-
-
-def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:
-    """Return the state at rest in a position."""
-    zeros = jnp.zeros(num_velocities, qpos.dtype)
-    return RobotState(qpos, zeros, zeros)
 
 
 def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
@@ -96,7 +61,7 @@ def _make_step(model: mujoco.MjModel) -> Callable[[RobotState, Array, Array], Ro
     `mjx.step` has stages that do nothing for a robot with plain servos and nothing else that acts on it, but
     take time: Jacobians of all bodies for forces from outside, and matrices of moments for the actuators.
     """
-    servos = _servos_of(model)
+    servos = read_servos(model)
     for name, found, expected in (
         ("integrator", model.opt.integrator, mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
         ("solver", model.opt.solver, mujoco.mjtSolver.mjSOL_NEWTON),
@@ -131,7 +96,7 @@ def _make_step(model: mujoco.MjModel) -> Callable[[RobotState, Array, Array], Ro
     return step
 
 
-def _act(servos: _Servos, data: mjx.Data, set_point: Array, speed: Array) -> tuple[Array, Array]:
+def _act(servos: Servos, data: mjx.Data, set_point: Array, speed: Array) -> tuple[Array, Array]:
     """Return torques and damping coefficients of the servos, one for each degree of freedom."""
     # That far ahead, a servo's damping against the speed of the set-point costs it nothing.
     control = jnp.clip(set_point + servos.damping / servos.stiffness * speed, *servos.control_range)
@@ -142,34 +107,3 @@ def _act(servos: _Servos, data: mjx.Data, set_point: Array, speed: Array) -> tup
     damping = jnp.where(torque == wanted, servos.damping, 0.0)
     zeros = jnp.zeros_like(data.qvel)
     return zeros.at[servos.qvel_index].add(torque), zeros.at[servos.qvel_index].add(damping)
-
-
-def _servos_of(model: mujoco.MjModel) -> _Servos:
-    """Read the servos out of a model; refuse other actuators."""
-    stiffness, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
-    is_servo = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-    joint = np.where(is_servo, model.actuator_trnid[:, 0], 0)
-    is_servo &= (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED) & (stiffness > 0)
-    is_servo &= model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
-    is_servo &= (model.actuator_biasprm[:, 0] == 0) & (model.actuator_biasprm[:, 1] == -stiffness)
-    is_servo &= model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
-    is_servo &= (model.actuator_gear[:, 0] == 1) & (model.jnt_actfrclimited[joint] == 0)
-    is_servo &= np.isin(model.jnt_type[joint], [mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE])
-    if not is_servo.all():
-        names = [model.actuator(i).name for i in np.flatnonzero(~is_servo)]
-        raise ValueError(f"every actuator must be a position servo on a joint, these are not: {names}")
-    control_range = _range(model.actuator_ctrllimited, model.actuator_ctrlrange)
-    torque_range = _range(model.actuator_forcelimited, model.actuator_forcerange)
-    return _Servos(
-        stiffness.astype(np.float32),
-        damping.astype(np.float32),
-        control_range.astype(np.float32),
-        torque_range.astype(np.float32),
-        qpos_index=model.jnt_qposadr[joint],
-        qvel_index=model.jnt_dofadr[joint],
-    )
-
-
-def _range(is_limited: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Return the lowest and the highest value of each actuator (2, nu), infinite where it has no limits."""
-    return np.where(is_limited.astype(bool), limits.T, [[-np.inf], [np.inf]])

@@ -14,7 +14,8 @@ from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, MAX_JOINT_SPEED
 from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints
 from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, params_from_theta
 from creps_jax.motion.walking.posture import Balance
-from creps_jax.physics.mjx import RobotState, initial_state, make_control_step
+from creps_jax.physics import mjx
+from creps_jax.physics.state import ControlStep, RobotState, initial_state
 from creps_jax.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
 from creps_jax.tasks.base import Task
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
@@ -27,6 +28,10 @@ _FALLEN_HEIGHT = 0.2
 _FALLEN_COSINE = 0.64
 # The shortest step the plan has to provide for, see `params_from_theta`.
 _SHORTEST_STEP = 0.08
+
+
+Physics = Callable[[mujoco.MjModel, int], ControlStep]
+"""(model, physics steps in a control step) -> the control step, for one robot."""
 
 
 class WalkReward(NamedTuple):
@@ -141,6 +146,7 @@ def nao_walk(
     noise: WalkNoise = WalkNoise(),
     balance: Balance = Balance(),
     model: mujoco.MjModel | None = None,
+    physics: Physics = mjx.make_control_step,
 ) -> Task:
     """Make the walking task: the context is the asked speed in m/s, theta the ten walking parameters.
 
@@ -158,6 +164,8 @@ def nao_walk(
         noise: Sizes of the noise.
         balance: How steps answer to the measured orientation; by default not at all, as in the paper.
         model: The robot; by default `load_nao()`.
+        physics: What steps the robot: `physics.mjx.make_control_step`, which any device runs, or
+            `physics.c.make_control_step`, the host's C MuJoCo.
 
     Returns:
         The task. Its rollout is for one robot; vmap it for a batch.
@@ -175,7 +183,7 @@ def nao_walk(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
         )
     sample_context = gaussian_contexts(low, high, clip=True) if sample_context is None else sample_context
-    begin, advance = _make_walker(model, duration, noise, balance)
+    begin, advance = _make_walker(model, duration, noise, balance, physics)
     num_ticks = round(duration / CONTROL_PERIOD)
     start_up_ticks = round(start_up / CONTROL_PERIOD)
 
@@ -214,6 +222,7 @@ def record_walk(
     noise: WalkNoise = WalkNoise(),
     balance: Balance = Balance(),
     model: mujoco.MjModel | None = None,
+    physics: Physics = mjx.make_control_step,
 ) -> WalkRecord:
     """Walk as `nao_walk` does and keep every control step, beyond a fall too.
 
@@ -224,11 +233,12 @@ def record_walk(
         noise: Sizes of the noise.
         balance: See `nao_walk`.
         model: The robot; by default `load_nao()`.
+        physics: See `nao_walk`.
 
     Returns:
         The walk.
     """
-    begin, advance = _make_walker(model, duration, noise, balance)
+    begin, advance = _make_walker(model, duration, noise, balance, physics)
     walk = begin(key, theta)
 
     def step(carry, tick):
@@ -244,11 +254,11 @@ def record_walk(
     )
 
 
-def _make_walker(model, duration, noise, balance):
+def _make_walker(model, duration, noise, balance, physics):
     """Return `begin(key, theta)` and `advance(walk, tick, robot, set_point)`, for rollout and record."""
     model = load_nao() if model is None else model
     _check_model(model)
-    control_step = make_control_step(model, round(CONTROL_PERIOD / model.opt.timestep))
+    control_step = physics(model, round(CONTROL_PERIOD / model.opt.timestep))
     num_ticks = round(duration / CONTROL_PERIOD)
     num_steps = round(duration / _SHORTEST_STEP) + 1
 

@@ -22,7 +22,8 @@ import mujoco  # noqa: E402
 import mujoco.rollout  # noqa: E402
 import numpy as np  # noqa: E402
 
-from creps_jax.tasks.nao_walk import CONTROL_PERIOD, load_nao, nao_walk, record_walk  # noqa: E402
+from creps_jax.physics import c, mjx  # noqa: E402
+from creps_jax.tasks.nao_walk import CONTROL_PERIOD, Physics, load_nao, nao_walk, record_walk  # noqa: E402
 from creps_jax.train import evaluate  # noqa: E402
 from experiments.walk import SETTINGS  # noqa: E402
 
@@ -40,6 +41,7 @@ def main() -> None:
     contestants = {
         "all devices": _ours(jax.devices()),
         "one device": _ours(jax.devices()[:1]),
+        "all, stepped by C": _ours(jax.devices(), c.make_control_step),
         "C MuJoCo": _bare_c(model, cores),
         "C, one thread": _bare_c(model, 1),
     }
@@ -55,17 +57,19 @@ def main() -> None:
     print(f"{cores} cores, {jax.device_count()} devices, batch {BATCH}, {ROUNDS} rounds")
     print("physics steps a second, median (least to most):")
     for name, values in rates.items():
-        print(f"  {name:14} {np.median(values):10,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
+        print(f"  {name:18} {np.median(values):10,.0f}   ({min(values):,.0f} to {max(values):,.0f})")
     for one, other in (
         ("all devices", "one device"),
         ("all devices", "C MuJoCo"),
+        ("all, stepped by C", "C MuJoCo"),
+        ("all, stepped by C", "one device"),
         ("C MuJoCo", "C, one thread"),
     ):
         print(f"{one} / {other}: {np.median(np.divide(rates[one], rates[other])):.2f}")
 
 
-def _ours(devices: list[jax.Device]) -> Callable[[], None]:
-    task = nao_walk(duration=DURATION, start_up=0.5, balance=BALANCE)
+def _ours(devices: list[jax.Device], physics: Physics = mjx.make_control_step) -> Callable[[], None]:
+    task = nao_walk(duration=DURATION, start_up=0.5, balance=BALANCE, physics=physics)
     contexts, thetas = jnp.full((BATCH, 1), 0.3), jnp.tile(jnp.array(THETA), (BATCH, 1))
 
     def run() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from creps_jax.motion.walking.posture import Balance
+from creps_jax.physics import c
 from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, _make_walker, load_nao, nao_walk, record_walk
 from tests.oracles import walk_c
 
@@ -48,6 +49,15 @@ def test_gaits_walk_at_their_speeds_and_a_bad_one_falls(outcome):
     np.testing.assert_allclose(outcome.speed[:3, :, 0].mean(axis=1), [0.08, 0.33, 0.50], atol=0.04)
     assert (outcome.seconds[:3] == DURATION).all()
     assert (outcome.seconds[3] < DURATION).all()
+
+
+def test_either_physics_walks_alike(outcome):
+    task = nao_walk(duration=DURATION, balance=BALANCE, physics=c.make_control_step)
+    other = rolled_out(task, [SLOW, MIDDLE, FAST, FALLING], SEEDS)
+    np.testing.assert_array_equal(other.fell, outcome.fell)
+    np.testing.assert_allclose(
+        other.speed[:3, :, 0].mean(axis=1), outcome.speed[:3, :, 0].mean(axis=1), atol=0.02
+    )
 
 
 def test_reward_is_that_of_eq_18(outcome):

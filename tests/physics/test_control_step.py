@@ -1,4 +1,4 @@
-"""MJX steps the robot as C MuJoCo does."""
+"""Either physics steps the robot as a plain loop around C MuJoCo does."""
 
 import jax
 import jax.numpy as jnp
@@ -6,9 +6,17 @@ import mujoco
 import numpy as np
 import pytest
 
-from creps_jax.physics.mjx import initial_state, make_control_step
+from creps_jax.physics import c, mjx
+from creps_jax.physics.state import initial_state
 from creps_jax.tasks.nao_walk import load_nao
 from tests.oracles.walk_c import servo_step
+
+PHYSICS = {"mjx": mjx.make_control_step, "c": c.make_control_step}
+
+
+@pytest.fixture(params=PHYSICS)
+def make_control_step(request):
+    return PHYSICS[request.param]
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +26,7 @@ def model():
 
 @pytest.mark.usefixtures("relaxed_promotion")
 @pytest.mark.parametrize(("change", "saturates"), [(0.02, False), (0.12, True)])
-def test_one_control_step_equals_c(change, saturates):
+def test_one_control_step_equals_c(make_control_step, change, saturates):
     rng = np.random.default_rng(0)
     # Enough iterations for both to converge: what is compared is the physics, not the rounding of the solver.
     model = load_nao()
@@ -45,7 +53,7 @@ def test_one_control_step_equals_c(change, saturates):
     assert (saturated > 0) == saturates
 
 
-def test_no_substep_is_an_error(model):
+def test_no_substep_is_an_error(make_control_step, model):
     with pytest.raises(ValueError, match="at least 1, got 0"):
         make_control_step(model, 0)
 
@@ -63,7 +71,7 @@ HINGE = """<mujoco><option integrator="implicitfast" {option}/><worldbody><body>
         '<position name="bad" joint="hinge" gear="2"/>',
     ],
 )
-def test_an_actuator_that_is_no_plain_servo_is_an_error(actuator):
+def test_an_actuator_that_is_no_plain_servo_is_an_error(make_control_step, actuator):
     with pytest.raises(ValueError, match="bad"):
         make_control_step(mujoco.MjModel.from_xml_string(HINGE.format(option="", actuator=actuator)), 4)
 
@@ -77,4 +85,26 @@ def test_another_solver_or_integrator_is_an_error(option, match):
     if "integrator" in option:
         xml = xml.replace('integrator="implicitfast" ', "")
     with pytest.raises(ValueError, match=match):
-        make_control_step(mujoco.MjModel.from_xml_string(xml), 4)
+        mjx.make_control_step(mujoco.MjModel.from_xml_string(xml), 4)
+
+
+def test_c_steps_a_batch_of_any_shape_from_any_state(model):
+    control_step = c.make_control_step(model, 5)
+    still = jnp.zeros(model.nu)
+    state = initial_state(jnp.asarray(model.key("stand").qpos, jnp.float32), model.nv)
+    alone = jax.jit(control_step)(state, still, still, still)
+    # The set-points of a batch, shared or not, are those of its robots.
+    states = jax.tree.map(lambda x: jnp.tile(x, (2, 3, 1)), state)
+    batch = jax.vmap(jax.vmap(control_step, (0, None, None, None)), (0, None, None, None))
+    moved = jax.jit(batch)(states, still, still, still)
+    assert moved.qpos.shape == (2, 3, model.nq)
+    np.testing.assert_array_equal(moved.qpos[1, 2], alone.qpos)
+    # One robot that is lost does not take the others with it.
+    lost = states._replace(qpos=states.qpos.at[0, 0].set(jnp.nan))
+    moved = jax.jit(batch)(lost, still, still, still)
+    np.testing.assert_array_equal(moved.qpos[1, 2], alone.qpos)
+    assert jnp.isnan(moved.qpos[0, 0]).all()
+    commands = jnp.zeros((3, model.nu)).at[1, 0].set(jnp.nan)
+    one_row = jax.tree.map(lambda x: x[0], states)
+    moved = jax.jit(jax.vmap(control_step))(one_row, commands, commands, commands)
+    assert jnp.isnan(moved.qpos).all(axis=1).tolist() == [False, True, False]

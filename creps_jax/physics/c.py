@@ -1,0 +1,105 @@
+"""Step a robot with position servos by C MuJoCo, one control step of the whole batch at a time."""
+
+import contextlib
+import copy
+import os
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from creps_jax.physics.servos import read_servos
+from creps_jax.physics.state import ControlStep, RobotState
+from creps_jax.typing import Array, Float
+
+__all__ = ["make_control_step"]
+
+_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+
+
+def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
+    """Return the function that steps the robot through one control step, on the host's cores.
+
+    It does what `creps_jax.physics.mjx.make_control_step` does, but for rounding. A `jax.vmap` of it is one
+    call for the whole batch. A robot whose state or set-points are not finite gets a state of NaN.
+
+    Args:
+        model: A model all of whose actuators are position servos on joints.
+        num_substeps: Physics steps in a control step.
+
+    Returns:
+        The control step, for one robot; vmap it for a batch.
+
+    Raises:
+        ValueError: If an actuator is no plain position servo on a joint, or there is no substep.
+    """
+    if num_substeps < 1:
+        raise ValueError(f"num_substeps must be at least 1, got {num_substeps}")
+    servos = read_servos(model)
+    # C would stand a robot up again whose state has become bad, and it would walk on as if nothing had been.
+    model = copy.copy(model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    shares = (np.arange(1, num_substeps + 1) / num_substeps)[:, None]
+    # So far ahead of the set-point, a servo's damping against the speed of the set-point costs it nothing.
+    lead = servos.damping / servos.stiffness
+    rest = np.append(model.qpos0, np.zeros(model.nv))
+    # Devices call at the same time, each from threads that come and go.
+    idle = []
+
+    def make():
+        data = [mujoco.MjData(model) for _ in range(_threads())]
+        return rollout.Rollout(nthread=len(data)), data
+
+    sizes = (model.nq, model.nv, model.nv, model.nu, model.nu, model.nu)
+
+    def step_batch(packed):
+        rows = np.array(packed, float).reshape(-1, sum(sizes))
+        qpos, qvel, warmstart, before, after, speed = np.split(rows, np.cumsum(sizes)[:-1], axis=1)
+        control = before[:, None] + shares * (after - before)[:, None] + (lead * speed)[:, None]
+        start = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
+        is_lost = ~(np.isfinite(start).all(axis=1) & np.isfinite(control).all(axis=(1, 2)))
+        for array, stand_in in ((start, np.append(0.0, rest)), (control, 0.0), (warmstart, 0.0)):
+            array[is_lost] = stand_in
+        with _borrowed(idle, make) as (pool, data):
+            states, _ = pool.rollout(model, data, start, control, initial_warmstart=warmstart)
+        states[is_lost] = np.nan
+        end = states[:, -1, 1 + model.nq :]
+        # The solver starts from the last acceleration, which the states tell by their velocities.
+        earlier = states[:, -2, 1 + model.nq :] if num_substeps > 1 else qvel
+        moved = [states[:, -1, 1:], (end - earlier) / model.opt.timestep]
+        return np.concatenate(moved, axis=1, dtype=np.float32).reshape(*packed.shape[:-1], -1)
+
+    def control_step(
+        state: RobotState,
+        before: Float[Array, " nu"],
+        after: Float[Array, " nu"],
+        speed: Float[Array, " nu"],
+    ) -> RobotState:
+        # One array each way: handing over many costs more than what is in them.
+        packed = jnp.concatenate([*state, before, after, speed])
+        shape = jax.ShapeDtypeStruct((sum(sizes[:3]),), jnp.float32)
+        moved = jax.pure_callback(step_batch, shape, packed, vmap_method="broadcast_all")
+        return RobotState(*jnp.split(moved, np.cumsum(sizes[:2])))
+
+    return control_step
+
+
+@contextlib.contextmanager
+def _borrowed(idle, make):
+    """Take something that no one else uses, or make it, and give it back."""
+    try:
+        item = idle.pop()
+    except IndexError:
+        item = make()
+    try:
+        yield item
+    finally:
+        idle.append(item)
+
+
+def _threads() -> int:
+    """Return the threads of one call: devices call at the same time, and share the cores."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores // jax.local_device_count())

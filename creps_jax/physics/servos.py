@@ -1,0 +1,65 @@
+"""The servos of a robot, read out of its MuJoCo model."""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from creps_jax.typing import Float, Int
+
+__all__ = ["Servos", "read_servos"]
+
+
+class Servos(NamedTuple):
+    """The position servos of a robot, each on a joint with one degree of freedom.
+
+    Attributes:
+        stiffness: Torque for an error of the position, N m/rad.
+        damping: Torque for an error of the speed, N m s/rad.
+        control_range: Lowest and highest set-points, rad.
+        torque_range: Lowest and highest torques, N m.
+        qpos_index: Index of each joint's position in qpos.
+        qvel_index: Index of each joint's speed in qvel.
+    """
+
+    stiffness: Float[np.ndarray, " nu"]
+    damping: Float[np.ndarray, " nu"]
+    control_range: Float[np.ndarray, "2 nu"]
+    torque_range: Float[np.ndarray, "2 nu"]
+    qpos_index: Int[np.ndarray, " nu"]
+    qvel_index: Int[np.ndarray, " nu"]
+
+
+def read_servos(model: mujoco.MjModel) -> Servos:
+    """Read the servos out of a model.
+
+    Raises:
+        ValueError: If an actuator is no plain position servo on a joint; it names them.
+    """
+    stiffness, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
+    is_servo = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    joint = np.where(is_servo, model.actuator_trnid[:, 0], 0)
+    is_servo &= (model.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED) & (stiffness > 0)
+    is_servo &= model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    is_servo &= (model.actuator_biasprm[:, 0] == 0) & (model.actuator_biasprm[:, 1] == -stiffness)
+    is_servo &= model.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE
+    is_servo &= (model.actuator_gear[:, 0] == 1) & (model.jnt_actfrclimited[joint] == 0)
+    is_servo &= np.isin(model.jnt_type[joint], [mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE])
+    if not is_servo.all():
+        names = [model.actuator(i).name for i in np.flatnonzero(~is_servo)]
+        raise ValueError(f"every actuator must be a position servo on a joint, these are not: {names}")
+    control_range = _range(model.actuator_ctrllimited, model.actuator_ctrlrange)
+    torque_range = _range(model.actuator_forcelimited, model.actuator_forcerange)
+    return Servos(
+        stiffness.astype(np.float32),
+        damping.astype(np.float32),
+        control_range.astype(np.float32),
+        torque_range.astype(np.float32),
+        qpos_index=model.jnt_qposadr[joint],
+        qvel_index=model.jnt_dofadr[joint],
+    )
+
+
+def _range(is_limited: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """Return the lowest and the highest value of each actuator (2, nu), infinite where it has no limits."""
+    return np.where(is_limited.astype(bool), limits.T, [[-np.inf], [np.inf]])

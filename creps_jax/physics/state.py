@@ -1,0 +1,34 @@
+"""What a robot's simulation carries from one control step to the next, whoever steps it."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from creps_jax.typing import Array, Float
+
+__all__ = ["ControlStep", "RobotState", "initial_state"]
+
+
+class RobotState(NamedTuple):
+    """All that MuJoCo carries from one step to the next.
+
+    Attributes:
+        qpos: Generalised positions (free joint first: position, wxyz quaternion), m and rad.
+        qvel: Generalised velocities, m/s and rad/s.
+        qacc_warmstart: Acceleration from which the contact solver starts.
+    """
+
+    qpos: Float[Array, " nq"]
+    qvel: Float[Array, " nv"]
+    qacc_warmstart: Float[Array, " nv"]
+
+
+ControlStep = Callable[[RobotState, Array, Array, Array], RobotState]
+"""(state, set-points before, set-points after, their speeds) -> state one control step later."""
+
+
+def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:
+    """Return the state at rest in a position."""
+    zeros = jnp.zeros(num_velocities, qpos.dtype)
+    return RobotState(qpos, zeros, zeros)
