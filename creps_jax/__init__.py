@@ -12,6 +12,7 @@ from creps_jax.features import FeatureMap, linear_features, quadratic_features, 
 from creps_jax.linalg import thomas_solve
 from creps_jax.motion.nao_kinematics import leg_fk, leg_ik
 from creps_jax.motion.walking.com import com_trajectory
+from creps_jax.mstep import bounded_ml
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
 from creps_jax.tasks import (
     Outcome,
@@ -41,6 +42,7 @@ __all__ = [
     "Outcome",
     "Task",
     "average_repeats",
+    "bounded_ml",
     "com_trajectory",
     "context_grid",
     "creps",

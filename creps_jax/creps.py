@@ -18,6 +18,7 @@ from creps_jax.archive import Archive, Batch, empty_archive, push, valid
 from creps_jax.dual import DualSolution, sample_kl, sample_weights, solve_dual
 from creps_jax.features import FeatureMap
 from creps_jax.linalg import exact_dot
+from creps_jax.mstep import MStep, WeightedSamples, weighted_ml
 from creps_jax.policy import LinearGaussian
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar
 
@@ -81,6 +82,7 @@ def creps(
     kl_bound: float | int = 0.5,
     archive_size: int,
     ridge: float | int = 1e-4,
+    m_step: MStep = weighted_ml,
 ) -> Creps:
     """Set up contextual relative entropy policy search.
 
@@ -89,7 +91,9 @@ def creps(
         baseline_features: Features phi(s) whose expectations over the contexts are kept.
         kl_bound: Largest relative entropy epsilon of one update, in nats.
         archive_size: Number L of the last samples that are learned from.
-        ridge: Penalty on the policy's coefficients, relative to the mean square of each feature.
+        ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale.
+        m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's, goes wherever
+            they lead; `bounded_ml()` keeps mean and covariance from moving too far at once.
 
     Returns:
         The functions `init`, `ask`, `tell` and `mean`. These raise ValueError, showing what they
@@ -102,6 +106,7 @@ def creps(
     """
     _check_settings(policy_features, baseline_features, kl_bound, archive_size, ridge)
     context_dim = policy_features.context_dim
+    scale = None if policy_features.scale is None else jnp.asarray(policy_features.scale, jnp.float32)
 
     def init(policy: LinearGaussian) -> CrepsState:
         theta_dim = _checked_theta_dim(policy, policy_features)
@@ -125,7 +130,8 @@ def creps(
         dual = solve_dual(samples.reward, baseline, is_valid, kl_bound=kl_bound)  # Eq. (13)
         weights = sample_weights(dual, samples.reward, baseline, is_valid)
         features = jax.vmap(policy_features.apply)(samples.context)
-        fitted = gaussian.fit_weighted_ml(features, samples.theta, weights, ridge=ridge)  # Eq. (14), (15)
+        weighted = WeightedSamples(features, samples.theta, weights, is_valid)
+        fitted = m_step(state.policy, weighted, ridge=ridge, scale=scale)  # Eq. (14), (15)
 
         num_valid = jnp.sum(is_valid, dtype=jnp.int32)
         is_finite = jnp.all(jnp.isfinite(fitted.coef)) & jnp.all(jnp.isfinite(fitted.cov_chol))

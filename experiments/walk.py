@@ -22,7 +22,7 @@ from creps_jax.tasks.nao_walk import WalkNoise, nao_walk
 from creps_jax.train import evaluate
 from experiments import plots, results, tables
 from experiments.errors import UserError
-from experiments.learning import Plan, Session, learn, trial_keys
+from experiments.learning import Plan, Session, learn, make_m_step, trial_keys
 from experiments.policy_file import Features, SavedPolicy, save_policy
 from experiments.registry import Claim
 from experiments.walking_policy import POLICY, START_UP, record, save_film
@@ -45,6 +45,9 @@ class Settings:
         repeats: rollouts of a sample, averaged.
         archive_size: L, samples kept.
         kl_bound: epsilon, nats.
+        mean_kl_bound: how far an update may move the policy's mean, nats, see `bounded_ml`; None is the
+            paper's unbounded fit.
+        cov_kl_bound: how far it may move the covariance, nats.
         features: kind, number and width of the policy's features.
         bounds: which box the parameters are kept in, a name in BOUNDS.
         start_mean: mean of the first policy before squashing; 0 is the middle of the box.
@@ -71,6 +74,8 @@ class Settings:
     repeats: int = 3
     archive_size: int = 600
     kl_bound: float = 0.5
+    mean_kl_bound: float | None = None
+    cov_kl_bound: float | None = None
     features: Features = Features("rbf", 5)
     bounds: str = "nao"
     start_mean: float = 0.0
@@ -106,19 +111,21 @@ _OURS = Settings(
     margin=0.02,
     learning_noise=1.6,
     start_mean=-0.3,
+    mean_kl_bound=0.5,
+    cov_kl_bound=0.05,
 )
 SETTINGS = {
     "quick": dataclasses.replace(
         _OURS,
-        iterations=115,
+        iterations=70,
         samples=45,
         first_samples=45,
         repeats=2,
-        archive_size=450,
+        archive_size=225,
         learning_duration=5.0,
     ),
     "paper": Settings(trials=5, bounds="paper"),
-    "best": dataclasses.replace(_OURS, iterations=120, samples=40, archive_size=400, eval_seeds=50),
+    "best": dataclasses.replace(_OURS, iterations=90, samples=40, archive_size=200, eval_seeds=50),
 }
 
 
@@ -199,7 +206,13 @@ def make_algorithm(settings: Settings) -> Creps:
     """Set up contextual REPS; the RBFs serve as policy and as baseline features."""
     features = settings.features.make(settings.low, settings.high)
     baseline = quadratic_features(1) if settings.features.kind == "linear" else features
-    return creps(features, baseline, kl_bound=settings.kl_bound, archive_size=settings.archive_size)
+    return creps(
+        features,
+        baseline,
+        kl_bound=settings.kl_bound,
+        archive_size=settings.archive_size,
+        m_step=make_m_step(settings.mean_kl_bound, settings.cov_kl_bound),
+    )
 
 
 def first_policy(settings: Settings) -> LinearGaussian:

@@ -1,0 +1,145 @@
+"""The bounded fit keeps its bounds, is the best within them, and knows no units."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import optimize
+
+from creps_jax import policy as gaussian
+from creps_jax.mstep import WeightedSamples, bounded_ml, weighted_ml
+from creps_jax.policy import LinearGaussian
+
+RIDGE = 1e-8
+
+
+def make_problem(key, num=60, dim=4, context_dim=1, greed=2.0):
+    """Return an old policy, and samples of it whose weights prefer some of them."""
+    keys = jax.random.split(key, 4)
+    contexts = jax.random.uniform(keys[0], (num, context_dim), minval=1.0, maxval=2.0)
+    features = jnp.concatenate([jnp.ones((num, 1)), contexts], axis=1)
+    coef = jax.random.normal(keys[1], (1 + context_dim, dim))
+    cov_chol = jnp.linalg.cholesky(0.5 * jnp.eye(dim) + 0.5) * jnp.linspace(0.1, 3.0, dim)[:, None]
+    policy = LinearGaussian(coef, cov_chol)
+    theta = features @ coef + jax.random.normal(keys[2], (num, dim)) @ cov_chol.T
+    weights = jax.nn.softmax(greed * (theta[:, 0] / 0.1 + jax.random.normal(keys[3], (num,))))
+    return policy, WeightedSamples(features, theta, weights, jnp.ones(num, bool))
+
+
+def parts(new, old, samples):
+    """Return the mean's and the covariance's part of the relative entropy, by the book, in float64."""
+    inverse = np.linalg.inv(np.asarray(old.cov_chol, float))
+    shift = np.asarray(samples.features, float) @ np.asarray(new.coef - old.coef, float)
+    mean = 0.5 * np.sum((shift @ inverse.T) ** 2, axis=1)[np.asarray(samples.is_valid)].mean()
+    ratio = inverse @ np.asarray(new.cov_chol, float)
+    change = ratio @ ratio.T
+    return mean, 0.5 * (np.trace(change) - len(change) - np.linalg.slogdet(change)[1])
+
+
+@pytest.mark.parametrize("bounds", [(1.0, 0.05), (0.1, 0.5), (1e-3, 1e-3)])
+@pytest.mark.parametrize("num", [8, 60, 2000], ids="{} samples".format)
+def test_active_bounds_are_met_to_a_percent(key, num, bounds):
+    policy, samples = make_problem(key, num)
+    new = jax.jit(bounded_ml(mean_kl_bound=bounds[0], cov_kl_bound=bounds[1]))(policy, samples, ridge=RIDGE)
+    np.testing.assert_allclose(parts(new, policy, samples), bounds, rtol=0.01)
+    total = jax.vmap(gaussian.kl, (None, None, 0))(new, policy, samples.features).mean()
+    assert total == pytest.approx(sum(bounds), rel=0.01)
+
+
+def test_bounds_out_of_reach_change_nothing(key):
+    policy, samples = make_problem(key)
+    new = bounded_ml(mean_kl_bound=1e3, cov_kl_bound=1e3)(policy, samples, ridge=RIDGE)
+    likeliest = weighted_ml(policy, samples, ridge=RIDGE)
+    np.testing.assert_allclose(new.coef, likeliest.coef, rtol=5e-3, atol=5e-3)
+    np.testing.assert_allclose(new.cov_chol, likeliest.cov_chol, rtol=1e-3, atol=1e-4)
+
+
+def test_nothing_likelier_is_within_the_bounds(key):
+    policy, samples = make_problem(key, dim=2)
+    bounds = 0.3, 0.1
+    new = bounded_ml(mean_kl_bound=bounds[0], cov_kl_bound=bounds[1])(policy, samples, ridge=RIDGE)
+    features, theta, weights = (np.asarray(x, float) for x in samples[:3])
+    inverse = np.linalg.inv(np.asarray(policy.cov_chol, float))
+    start = np.ravel(policy.coef).astype(float)
+
+    def mean_cost(flat):
+        residual = (theta - features @ flat.reshape(2, 2)) @ inverse.T
+        return weights @ np.sum(residual**2, axis=1)
+
+    def mean_room(flat):
+        shift = features @ (flat - start).reshape(2, 2) @ inverse.T
+        return bounds[0] - 0.5 * np.mean(np.sum(shift**2, axis=1))
+
+    limit = {"type": "ineq", "fun": mean_room}
+    best = optimize.minimize(mean_cost, start, method="SLSQP", constraints=limit, options={"maxiter": 500}).x
+    np.testing.assert_allclose(np.ravel(new.coef), best, rtol=0.01, atol=0.01)
+
+    # Z of Eq. (15) makes the scatter unbiased.
+    residual = theta - features @ np.asarray(new.coef, float)
+    scatter = (residual.T * weights) @ residual / (1.0 - np.sum(weights**2))
+
+    def factor(flat):
+        return np.array([[np.exp(flat[0]), 0.0], [flat[1], np.exp(flat[2])]])
+
+    def cov_cost(flat):
+        cov = factor(flat) @ factor(flat).T
+        return np.linalg.slogdet(cov)[1] + np.trace(np.linalg.solve(cov, scatter))
+
+    old = np.asarray(policy.cov_chol, float)
+    limit = {
+        "type": "ineq",
+        "fun": lambda flat: bounds[1] - parts(policy._replace(cov_chol=factor(flat)), policy, samples)[1],
+    }
+    start = [np.log(old[0, 0]), old[1, 0], np.log(old[1, 1])]
+    best = optimize.minimize(cov_cost, start, method="SLSQP", constraints=limit).x
+    np.testing.assert_allclose(new.cov_chol, factor(best), rtol=0.01, atol=0.01)
+
+
+@pytest.mark.parametrize("m_step", [weighted_ml, bounded_ml()], ids=["weighted_ml", "bounded_ml"])
+def test_units_of_parameters_and_contexts_do_not_matter(key, m_step):
+    policy, samples = make_problem(key)
+    new = m_step(policy, samples, ridge=1e-4)
+    # Parameters in other units and from other zeros; a context in another unit and from another zero.
+    unit, zero = np.array([1e-3, 1.0, 50.0, 1e3]), np.array([1.0, -3.0, 0.0, 50.0])
+    change = np.array([[1.0, 2.0], [0.0, 0.1]])
+
+    def converted(coef):
+        return np.linalg.solve(change, np.asarray(coef, float) * unit + np.array([[1.0], [0.0]]) * zero)
+
+    other_policy = LinearGaussian(
+        jnp.float32(converted(policy.coef)), jnp.float32(unit[:, None] * np.asarray(policy.cov_chol))
+    )
+    other = m_step(
+        other_policy,
+        samples._replace(
+            features=jnp.float32(np.asarray(samples.features) @ change),
+            theta=jnp.float32(np.asarray(samples.theta) * unit + zero),
+        ),
+        ridge=1e-4,
+    )
+    cov_chol = unit[:, None] * np.asarray(new.cov_chol)
+    spread = np.linalg.norm(cov_chol, axis=1)
+    np.testing.assert_allclose(other.cov_chol / spread[:, None], cov_chol / spread[:, None], atol=0.01)
+    shift = np.asarray(samples.features) @ (change @ np.asarray(other.coef) - change @ converted(new.coef))
+    np.testing.assert_allclose(shift / spread, 0.0, atol=0.02)
+
+
+def test_what_does_not_count_is_not_looked_at(key):
+    policy, samples = make_problem(key)
+    m_step = bounded_ml()
+    alone = m_step(policy, samples, ridge=RIDGE)
+    junk = jnp.full((5, 4), 1e6)
+    padded = WeightedSamples(
+        jnp.concatenate([samples.features, junk[:, :2]]),
+        jnp.concatenate([samples.theta, junk]),
+        jnp.concatenate([samples.weights, jnp.zeros(5)]),
+        jnp.concatenate([samples.is_valid, jnp.zeros(5, bool)]),
+    )
+    for left, right in zip(alone, m_step(policy, padded, ridge=RIDGE), strict=True):
+        np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 0.1), (1.0, -1.0), (1.0, float("nan"))])
+def test_bounds_have_to_be_positive(bounds):
+    with pytest.raises(ValueError, match=r"_kl_bound must be positive, got"):
+        bounded_ml(mean_kl_bound=bounds[0], cov_kl_bound=bounds[1])
