@@ -24,6 +24,7 @@ Learn, plot and check what the project can do.
   python -m experiments run walk --preset quick   learn to walk, a few minutes
   python -m experiments run walk --speed 0.3      show the learned walk at a speed, in m/s
   python -m experiments run walk --resume         go on with the latest unfinished run
+  python -m experiments run all                   the paper's Figures 5 to 9, some ten minutes
   python -m experiments plot walk                 draw the figures of the latest results again
   python -m experiments check                     hold the latest results against the paper
   python -m experiments video                     film a policy at several speeds
@@ -51,7 +52,7 @@ class Run:
     """Run an experiment; `python -m experiments list` names them.
 
     Attributes:
-        name: The experiment.
+        name: The experiment, or "all" for the paper's Figures 5 to 9.
         preset: How thoroughly: quick, paper or best; each experiment's first one by default.
         iterations: Iterations of learning, in place of the preset's.
         trials: Trials with random keys of their own, in place of the preset's.
@@ -152,6 +153,8 @@ def _list(_: List) -> int:
 
 
 def _run(command: Run) -> int:
+    if command.name == registry.ALL:
+        return _run_all(command)
     registry.check_name(command.name)
     if command.speed is not None:
         return _show(command, command.speed)
@@ -174,6 +177,14 @@ def _run(command: Run) -> int:
     # A run that is told to end saves what it has, as one that is interrupted does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     runner.run(request, console=Console(highlight=False, soft_wrap=True), say=_say)
+    return 0
+
+
+def _run_all(command: Run) -> int:
+    if command.resume or command.speed is not None:
+        raise UserError("--resume and --speed go with one experiment, not with all")
+    for name in registry.FIGURES:
+        _run(dataclasses.replace(command, name=name, out=command.out and command.out / name))
     return 0
 
 

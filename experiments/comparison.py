@@ -14,7 +14,8 @@ from creps_jax.features import FeatureMap
 from creps_jax.policy import LinearGaussian
 from creps_jax.tasks.base import Task
 from creps_jax.train import evaluate
-from experiments.learning import Plan, Session, learn, trial_keys
+from experiments import plots
+from experiments.learning import Plan, Session, learn, make_m_step, trial_keys
 
 NUM_EVALUATED = 40
 
@@ -44,6 +45,9 @@ class LearnerSettings:
         archive_size: L, samples kept.
         kl_bound: epsilon, nats.
         ridge: relative penalty on the policy's coefficients.
+        mean_kl_bound: how far an update may move the policy's mean, nats, see `bounded_ml`; None is the
+            paper's unbounded fit.
+        cov_kl_bound: how far it may move the covariance, nats.
         start_std: standard deviation of the first policy, whose mean is zero.
     """
 
@@ -53,6 +57,8 @@ class LearnerSettings:
     archive_size: int = 2000
     kl_bound: float = 0.5
     ridge: float = 1e-4
+    mean_kl_bound: float | None = None
+    cov_kl_bound: float | None = None
     start_std: float = 1.0
 
 
@@ -61,7 +67,11 @@ def make_contender(
 ) -> Contender:
     """Put a contender together from policy and baseline features and an experiment's settings."""
     algorithm = creps(
-        *features, kl_bound=settings.kl_bound, archive_size=settings.archive_size, ridge=settings.ridge
+        *features,
+        kl_bound=settings.kl_bound,
+        archive_size=settings.archive_size,
+        ridge=settings.ridge,
+        m_step=make_m_step(settings.mean_kl_bound, settings.cov_kl_bound),
     )
     dim = task.theta_dim
     start = LinearGaussian(jnp.zeros((features[0].size, dim)), settings.start_std * jnp.eye(dim))
@@ -87,8 +97,9 @@ def compare(
 
     Returns:
         `context`, the grid; `episodes` (iterations,) and `evaluated`, the iterations (from 1) after which
-        mean policies were judged; and for each NAME: `NAME.sample_reward` and `NAME.kl` (trials, iterations),
-        `NAME.grid_reward` (trials, evaluated, n), `NAME.coef` (trials, p, d), the last policies'.
+        mean policies were judged; and for each NAME: `NAME.sample_reward` and `plots.TRACES` of the
+        updates (trials, iterations), `NAME.grid_reward` (trials, evaluated, n), `NAME.coef` (trials, p, d),
+        the last policies'.
     """
     # Rollouts as short as these are not worth sharing out, trials are.
     devices = jax.local_devices()
@@ -107,7 +118,8 @@ def compare(
         # A resumed run may have gone on for longer than is asked of it now.
         coef = log["coef"][:, evaluated - 1]
         arrays[f"{name}.sample_reward"] = log["mean_reward"][:, : plan.iterations]
-        arrays[f"{name}.kl"] = log["info.kl"][:, : plan.iterations]
+        for field in plots.TRACES:
+            arrays[f"{name}.{field}"] = log[f"info.{field}"][:, : plan.iterations]
         arrays[f"{name}.grid_reward"] = _grid_reward(evaluate_key, contender, coef, grid)
         arrays[f"{name}.coef"] = coef[:, -1]
     return arrays

@@ -15,6 +15,14 @@ COLOURS = ("#0b6e99", "#d1495b", "#edae49", "#3d7a4f", "#7a5195")
 PAPER_COLOUR = "#8a8a8a"
 FALL_COLOUR = "#d1495b"
 
+TRACES = {
+    "kl": ("KL of the weights (nats)", True),
+    "policy_kl": ("KL of the policy (nats)", True),
+    "entropy": ("entropy of the policy (nats)", False),
+    "effective_samples": ("effective samples", True),
+}
+"""What updates are watched by, fields of `CrepsInfo`: heading, and whether the axis is logarithmic."""
+
 _STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
     "savefig.dpi": 150,
@@ -114,25 +122,57 @@ def learning_curves(
     panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray]]],
     *,
     references: Mapping[str, float] | None = None,
+    columns: int | None = None,
+    share: bool = True,
 ) -> Figure:
-    """Draw learning curves of one or more algorithms, in panels that share their scales.
+    """Draw learning curves of one or more algorithms, in panels.
 
     Args:
         panels: by title, curves: by name, (episodes (iterations,), rewards (trials, iterations)).
         references: horizontal lines by name, the paper's result for example.
+        columns: panels side by side; all by default.
+        share: whether the panels share their scales.
     """
-    width = 6.4 if len(panels) == 1 else 5.0 * len(panels)
-    figure, grid = new_figure(1, len(panels), width=width, sharex=True, sharey=True)
-    for axes, (title, curves) in zip(grid[0], panels.items(), strict=True):
+    columns = columns or len(panels)
+    rows = math.ceil(len(panels) / columns)
+    width = 6.4 if len(panels) == 1 else min(5.0, 14.0 / columns + 0.5) * columns
+    figure, grid = new_figure(rows, columns, width=width, height=3.4 * rows + 0.6, sharex=share, sharey=share)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_visible(False)
+    for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
         for label, (episodes, rewards) in curves.items():
             plot_learning_curve(axes, episodes, rewards, label)
         for label, value in (references or {}).items():
             axes.axhline(value, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label=label)
         axes.set(xlabel="episodes", title=title)
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
-        axes.legend(loc="lower right")
-    grid[0, 0].set_ylabel("mean reward")
-    reward_scale(grid[0, 0], [rewards for curves in panels.values() for _, rewards in curves.values()])
+        axes.legend(loc="lower right", fontsize=10 if columns < 3 else 7)
+        if not share:
+            reward_scale(axes, [rewards for _, rewards in curves.values()])
+    for axes in grid[:, 0]:
+        axes.set_ylabel("mean reward")
+    if share:
+        curves = [rewards for curves in panels.values() for _, rewards in curves.values()]
+        reward_scale(grid[0, 0], curves)
+    return figure
+
+
+def update_traces(episodes: np.ndarray, traces: Mapping[str, Mapping[str, np.ndarray]]) -> Figure:
+    """Draw how updates went: relative entropy of the weights and of the policy, entropy, effective samples.
+
+    Args:
+        episodes: (iterations,) rollouts so far.
+        traces: by name of the learner, and then of the field in `TRACES`, (trials, iterations).
+    """
+    figure, grid = new_figure(1, len(TRACES), width=3.6 * len(TRACES), height=3.4)
+    for axes, (field, (label, is_log)) in zip(grid[0], TRACES.items(), strict=True):
+        for name, fields in traces.items():
+            plot_learning_curve(axes, episodes, fields[field], name)
+        axes.set(xlabel="episodes", title=label)
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        if is_log:
+            axes.set_yscale("log")
+    grid[0, 0].legend(loc="best", fontsize=8)
     return figure
 
 

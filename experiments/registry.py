@@ -14,8 +14,15 @@ DESCRIPTIONS = {
     "fig05_sinus": "learn the sine of the context, with linear and with RBF features (Fig. 5)",
     "fig06_reaching": "reach via-points with a planar arm (Fig. 6 and 7)",
     "fig08_hole": "reach into a hole with a planar arm (Fig. 8 and 9)",
+    "updates": "the paper's fit of the policy against the bounded one, on all tasks but walking",
 }
 """What each experiment shows; its module has the same name."""
+
+
+ALL = "all"
+"""Stands for `FIGURES`, one after the other."""
+
+FIGURES = ("fig05_sinus", "fig06_reaching", "fig08_hole")
 
 
 class Claim(NamedTuple):

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import comparison
+from experiments import comparison, updates
 from experiments.errors import UserError
 from experiments.fig08_hole import Settings as HoleSettings
 from experiments.learning import Session
@@ -63,6 +63,23 @@ def test_a_figure_learns_draws_and_judges(name):
         value = claim.measure(arrays)
         # What needs other numbers of RBFs says so.
         assert np.isfinite(value) or "numbers of RBFs" in claim.metric
+
+
+def test_updates_are_compared_on_the_same_problem(monkeypatch, tmp_path):
+    monkeypatch.setattr(updates, "BENCHES", {"sphere": updates.BENCHES["sphere"]})
+    said = []
+    settings = updates.Settings(iterations=8, trials=2)
+    arrays = updates.run(settings, jax.random.key(0), Session())
+    first = [arrays[f"sphere/sphere-{fit}.sample_reward"][:, 0] for fit in ("plain", "archive", "bounded")]
+    np.testing.assert_array_equal(first[0], first[1])
+    np.testing.assert_array_equal(first[0], first[2])
+    # The unbounded fit moves by many nats, the bounded one by what it may.
+    assert arrays["sphere/sphere-plain.policy_kl"].min() > 5.0
+    np.testing.assert_allclose(arrays["sphere/sphere-bounded.policy_kl"], 1.05, rtol=0.01)
+    assert updates.share_of_episodes(arrays, "sphere") <= 1.0
+    assert set(updates.plot(arrays)) == {"learning_curves", "sphere_updates"}
+    updates.finish(settings, arrays, tmp_path, said.append)
+    assert (tmp_path / "table.md").read_text() == said[0] and "sphere" in said[0]
 
 
 def test_the_hole_needs_the_number_of_rbfs_of_the_paper():

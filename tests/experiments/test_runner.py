@@ -138,3 +138,13 @@ def test_the_command_runs_resumes_and_reports_mistakes(tiny, capsys, monkeypatch
     assert "iteration 4/4" in capsys.readouterr().out
     assert main(["run", "tiny", "--out", "part"]) == 2
     assert capsys.readouterr().err.startswith("error: part holds a run already")
+
+
+def test_all_runs_every_figure_in_a_folder_of_its_own(tiny, monkeypatch):
+    monkeypatch.setattr(registry, "FIGURES", ("tiny", "tiny"))
+    assert main(["run", "all", "--iterations", "2"]) == 0
+    assert len(list(Path("results/tiny").iterdir())) == 2
+    monkeypatch.setattr(registry, "FIGURES", ("tiny",))
+    assert main(["run", "all", "--iterations", "2", "--out", "here"]) == 0
+    assert (Path("here") / "tiny" / "arrays.npz").exists()
+    assert main(["run", "all", "--resume"]) == 2

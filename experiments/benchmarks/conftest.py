@@ -1,0 +1,8 @@
+"""Set the process up as the command line does, but without the cache of compiled programs."""
+
+import os
+
+from experiments.process import prepare
+
+os.environ["JAX_COMPILATION_CACHE_DIR"] = ""
+prepare()

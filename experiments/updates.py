@@ -1,0 +1,237 @@
+"""Hold the bounded fit of the policy against the paper's, on test functions and all tasks but walking."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+from creps_jax.contexts import context_grid
+from creps_jax.features import FeatureMap, linear_features, rbf_features
+from creps_jax.policy import LinearGaussian
+from creps_jax.tasks import Task, contextual_function, hole_reaching, sinus, via_point_reaching
+from creps_jax.tasks.functions import ackley, ellipsoid, rastrigin, rosenbrock, sphere
+from experiments import plots, results
+from experiments.comparison import LearnerSettings, compare, make_contender, mean_policy_curve
+from experiments.learning import Session
+from experiments.registry import Claim
+from experiments.tables import to_markdown
+
+LABELS = {"plain": "weighted ML, no archive", "archive": "weighted ML", "bounded": "bounded"}
+FUNCTIONS = {
+    "sphere": sphere,
+    "ellipsoid": ellipsoid,
+    "rosenbrock": rosenbrock,
+    "rastrigin": rastrigin,
+    "ackley": ackley,
+}
+THETA_DIM, CONTEXT_DIM = 20, 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of the experiment: with 50 samples an iteration, 10,000 rollouts of each trial.
+
+    Attributes:
+        iterations: iterations of learning.
+        trials: trials of each contender.
+        samples: new samples of an iteration.
+    """
+
+    iterations: int = 200
+    trials: int = 20
+    samples: int = 50
+
+
+SETTINGS = {"best": Settings(), "quick": Settings(trials=4, iterations=100)}
+
+
+class Bench(NamedTuple):
+    """A task, what to learn it with, and how."""
+
+    task: Task
+    features: FeatureMap
+    grid: jax.Array
+    start: LinearGaussian
+    learners: Mapping[str, LearnerSettings]
+
+
+def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
+    """Learn each task with each fit, from the same first policy and the same keys."""
+    setup_key, learn_key = jax.random.split(key)
+    arrays = {}
+    for name, make in BENCHES.items():
+        bench = make(setup_key)
+        contenders = {}
+        for fit, learner in bench.learners.items():
+            contender = make_contender(bench.task, (bench.features, bench.features), learner)
+            contenders[f"{name}-{fit}"] = contender._replace(start=bench.start)
+        plan = LearnerSettings(settings.iterations, settings.trials, settings.samples)
+        found = compare(contenders, plan, learn_key, grid=bench.grid, session=session)
+        arrays |= {f"{name}/{field}": values for field, values in found.items()}
+    return arrays
+
+
+def _function_bench(function: Callable[[jax.Array], jax.Array], key: jax.Array) -> Bench:
+    transform_key, start_key = jax.random.split(key)
+    features = linear_features(CONTEXT_DIM)
+    coef = jnp.zeros((features.size, THETA_DIM)).at[0].set(jax.random.normal(start_key, (THETA_DIM,)))
+    return Bench(
+        contextual_function(function, jax.random.normal(transform_key, (THETA_DIM, CONTEXT_DIM))),
+        features,
+        context_grid((1.0, 1.0), (2.0, 2.0), 5),
+        LinearGaussian(coef, jnp.eye(THETA_DIM)),
+        {
+            "plain": LearnerSettings(archive_size=50, kl_bound=1.0, ridge=1e-10),
+            "archive": LearnerSettings(archive_size=1000, kl_bound=1.0, ridge=1e-10),
+            "bounded": LearnerSettings(
+                archive_size=200, kl_bound=1.0, ridge=1e-10, mean_kl_bound=1.0, cov_kl_bound=0.05
+            ),
+        },
+    )
+
+
+def _task_bench(
+    task: Task, features: FeatureMap, grid: jax.Array, *, start_std: float, cov_kl_bound: float
+) -> Bench:
+    start = LinearGaussian(jnp.zeros((features.size, task.theta_dim)), start_std * jnp.eye(task.theta_dim))
+    learners = {
+        "archive": LearnerSettings(),
+        "bounded": LearnerSettings(archive_size=400, mean_kl_bound=0.3, cov_kl_bound=cov_kl_bound),
+    }
+    return Bench(task, features, grid, start, learners)
+
+
+def _sinus_bench(key: jax.Array) -> Bench:
+    del key
+    high = 5 * math.pi
+    features, grid = rbf_features(0.0, high, 11), context_grid(0.0, high, 201)
+    return _task_bench(sinus(0.0, high), features, grid, start_std=1.0, cov_kl_bound=0.02)
+
+
+def _reaching_bench(key: jax.Array) -> Bench:
+    del key
+    low, high = (-1.5, -1.5), (-0.5, -0.5)
+    features, grid = rbf_features(low, high, 2), context_grid(low, high, 6)
+    return _task_bench(via_point_reaching(), features, grid, start_std=1.0, cov_kl_bound=0.005)
+
+
+def _hole_bench(key: jax.Array) -> Bench:
+    del key
+    features, grid = rbf_features(1.4, 2.0, 6), context_grid(1.4, 2.0, 25)
+    return _task_bench(hole_reaching(), features, grid, start_std=0.5, cov_kl_bound=0.005)
+
+
+BENCHES: dict[str, Callable[[jax.Array], Bench]] = {
+    **{name: partial(_function_bench, function) for name, function in FUNCTIONS.items()},
+    "sinus": _sinus_bench,
+    "reaching": _reaching_bench,
+    "hole": _hole_bench,
+}
+
+
+def of_bench(arrays: Mapping[str, np.ndarray], bench: str) -> dict[str, np.ndarray]:
+    """Return the arrays of one task, as `compare` named them."""
+    prefix = f"{bench}/"
+    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+
+
+def fits(arrays: Mapping[str, np.ndarray], bench: str) -> dict[str, str]:
+    """Return the contenders of a task by their labels."""
+    found = of_bench(arrays, bench)
+    return {label: f"{bench}-{fit}" for fit, label in LABELS.items() if f"{bench}-{fit}.coef" in found}
+
+
+def share_of_episodes(arrays: Mapping[str, np.ndarray], bench: str) -> float:
+    """Return in which share of the episodes the bounded fit gets as far as the paper's does in all of them.
+
+    Both by the median of the trials' mean policies; infinite if it never does.
+    """
+    found = of_bench(arrays, bench)
+    episodes, bounded = mean_policy_curve(found, f"{bench}-bounded")
+    _, archive = mean_policy_curve(found, f"{bench}-archive")
+    is_there = np.median(bounded, axis=0) >= np.median(archive[:, -1])
+    return float(episodes[is_there][0] / episodes[-1]) if is_there.any() else math.inf
+
+
+def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
+    """Return the table of the last mean policies, medians of the trials, and of the episodes it took."""
+    columns: dict[str, list[str]] = {"task": list(BENCHES)}
+    for label in LABELS.values():
+        columns[label] = []
+        for bench in BENCHES:
+            contender = fits(arrays, bench).get(label)
+            curve = None if contender is None else mean_policy_curve(of_bench(arrays, bench), contender)[1]
+            columns[label].append("" if curve is None else f"{np.median(curve[:, -1]):.3g}")
+    columns["as good after"] = [f"{share_of_episodes(arrays, bench):.0%}" for bench in BENCHES]
+    return columns
+
+
+def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+    """Draw the learning curves on each task, and how the updates on the sphere went."""
+    panels = {
+        bench: {
+            label: mean_policy_curve(of_bench(arrays, bench), contender)
+            for label, contender in fits(arrays, bench).items()
+        }
+        for bench in BENCHES
+    }
+    found = of_bench(arrays, "sphere")
+    traces = {
+        label: {field: found[f"{contender}.{field}"] for field in plots.TRACES}
+        for label, contender in fits(arrays, "sphere").items()
+    }
+    return {
+        "learning_curves": plots.learning_curves(panels, columns=4, share=False),
+        "sphere_updates": plots.update_traces(found["episodes"], traces),
+    }
+
+
+def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
+    """Write and say the table."""
+    del settings
+    text = to_markdown(table(arrays))
+    results.save_text(folder / "table.md", text)
+    say(text)
+
+
+def _last_samples(arrays: Mapping[str, np.ndarray], contender: str) -> float:
+    return float(of_bench(arrays, "sphere")[f"sphere-{contender}.sample_reward"][:, -1].mean())
+
+
+def _largest_move(arrays: Mapping[str, np.ndarray]) -> float:
+    """Return the largest relative entropy of the bounded fit on the sphere, as a share of its bound."""
+    bound = 1.0 + 0.05
+    return float(of_bench(arrays, "sphere")["sphere-bounded.policy_kl"].max() / bound)
+
+
+CLAIMS = (
+    Claim(
+        "sphere, weighted ML: mean reward of the new samples after 10,000 (bolero: -48.6)",
+        None,
+        lambda arrays: _last_samples(arrays, "archive"),
+        low=-48.6,
+    ),
+    Claim(
+        "sphere, bounded: the same",
+        None,
+        lambda arrays: _last_samples(arrays, "bounded"),
+        low=-1e-4,
+    ),
+    Claim("sphere, bounded: largest move of the policy, of its bound", None, _largest_move, high=1.01),
+    *(
+        Claim(
+            f"{bench}: share of episodes in which the bounded fit is as good as weighted ML after all",
+            None,
+            lambda arrays, bench=bench: share_of_episodes(arrays, bench),
+            high=0.5,
+        )
+        for bench in BENCHES
+    ),
+)
