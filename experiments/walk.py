@@ -268,6 +268,10 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
         "learning_curve": plots.learning_curves(
             {"Learning to walk": {"new samples": (arrays["episodes"], arrays["log.mean_reward"])}}
         ),
+        "updates": plots.update_traces(
+            arrays["episodes"],
+            {"walk": {field: arrays[f"log.info.{field}"] for field in plots.TRACES}},
+        ),
         "parameters": plots.parameters_against_context(
             arrays["fine_speeds"],
             arrays["fine_theta"],

@@ -6,6 +6,7 @@
 #       extension: .py
 #       format_name: percent
 #       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -124,7 +125,7 @@ except VideoError as error:
 # below are yours.
 
 # %%
-ask, tell = jax.jit(algorithm.ask), jax.jit(algorithm.tell)
+ask, tell = algorithm.ask, algorithm.tell
 state = algorithm.init(start)
 for iteration in range(3):
     key = jax.random.fold_in(jax.random.key(1), iteration)

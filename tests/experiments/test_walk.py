@@ -57,7 +57,7 @@ def bench(tmp_path, monkeypatch):
 def test_the_result_folder_is_complete(bench):
     folder = runner.run(runner.Request("walk"), console=None, say=lambda _: None)
     files = "arrays.npz manifest.json checkpoint-walk.npz claims.md policy.npz table.csv table.md"
-    figures = "learning_curve.png parameters.png speed.png"
+    figures = "learning_curve.png parameters.png speed.png updates.png"
     assert {path.name for path in folder.iterdir()} == {*files.split(), *figures.split()}
     assert bench == [folder / "walk.mp4"]
     arrays = results.load_arrays(folder / "arrays.npz")
