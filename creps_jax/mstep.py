@@ -48,10 +48,9 @@ def weighted_ml(
     ridge: ScalarLike,
     scale: Float[Array, " p"] | None = None,
 ) -> LinearGaussian:
-    """Fit by weighted maximum likelihood, wherever that leads: `fit_weighted_ml` as an `MStep`."""
-    del policy
+    """Fit by weighted maximum likelihood, wherever that leads: `fit_weighted_ml` from the old policy on."""
     features, theta, weights, _ = samples
-    return fit_weighted_ml(features, theta, weights, ridge=ridge, scale=scale)
+    return fit_weighted_ml(features, theta, weights, ridge=ridge, scale=scale, start=policy.coef)
 
 
 def bounded_ml(*, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05) -> MStep:

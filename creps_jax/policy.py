@@ -123,6 +123,7 @@ def fit_weighted_ml(
     *,
     ridge: ScalarLike,
     scale: Float[Array, " p"] | None = None,
+    start: Float[Array, "p d"] | None = None,
 ) -> LinearGaussian:
     """Fit the policy to weighted samples by maximum likelihood.
 
@@ -137,6 +138,8 @@ def fit_weighted_ml(
         ridge: Penalty on the coefficients, but for those that make a constant, relative to the square of
             each feature's scale; may be zero.
         scale: Size of each feature, see `weighted_ridge`; by default its standard deviation.
+        start: Coefficients from which the ridge counts, those of the last policy: what a ridge towards a
+            constant takes away in each of many updates adds up. By default that constant.
 
     Returns:
         The policy. Its covariance is taken about its own, context-dependent mean; it is finite and positive
@@ -158,16 +161,22 @@ def fit_weighted_ml(
     total = jnp.sum(weights)
     weights = weights / jnp.where(total > 0, total, 1.0)
 
+    size = jnp.max(jnp.abs(theta), axis=0)
+    start = jnp.zeros((features.shape[1], theta.shape[1]), theta.dtype) if start is None else start
+    theta = jnp.where(is_weighted[:, None], theta - exact_dot(features, start), 0.0)
     centre = exact_dot(weights, theta)
     ones = jnp.ones((theta.shape[0], 1), theta.dtype)
-    constant = weighted_ridge(features, ones, weights, ridge=0.0)  # the features' nearest to a constant
+    # The features' nearest to a constant. Of features that sum to one it is that sum, wherever samples are.
+    guess = jnp.ones((features.shape[1], 1), theta.dtype)
+    short = ones - exact_dot(features, guess)
+    constant = guess + weighted_ridge(features, short, weights, ridge=0.0, scale=scale)
     rest = (theta - centre[None, :]) + (ones - exact_dot(features, constant)) * centre[None, :]
     if scale is None:
         scale = _spread(features, weights)
     slope = weighted_ridge(features, rest, weights, ridge=ridge, scale=scale, free=constant[:, 0])  # Eq. (14)
     residual = jnp.where(is_weighted[:, None], rest - exact_dot(features, slope), 0.0)
-    cov_chol = _weighted_cov_chol(residual, weights, jnp.max(jnp.abs(theta), axis=0))
-    return LinearGaussian(constant * centre[None, :] + slope, cov_chol)
+    cov_chol = _weighted_cov_chol(residual, weights, size)
+    return LinearGaussian(start + constant * centre[None, :] + slope, cov_chol)
 
 
 def _spread(features: Float[Array, "n p"], weights: Float[Array, " n"]) -> Float[Array, " p"]:
