@@ -135,7 +135,8 @@ def creps(
 
         num_valid = jnp.sum(is_valid, dtype=jnp.int32)
         is_finite = jnp.all(jnp.isfinite(fitted.coef)) & jnp.all(jnp.isfinite(fitted.cov_chol))
-        is_updated = is_finite & (num_valid >= sum(state.policy.coef.shape))
+        is_usable = is_finite & jnp.all(jnp.diagonal(fitted.cov_chol) > 0)
+        is_updated = is_usable & (num_valid >= sum(state.policy.coef.shape))
         policy = jax.tree.map(lambda new, old: jnp.where(is_updated, new, old), fitted, state.policy)
 
         info = CrepsInfo(

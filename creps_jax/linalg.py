@@ -119,6 +119,9 @@ def weighted_ridge(
             "weighted_ridge needs features (n, p), targets (n, d) and weights (n,), "
             f"got shapes {features.shape}, {targets.shape} and {weights.shape}"
         )
+    for name, vector in (("scale", scale), ("free", free)):
+        if vector is not None and vector.shape != (num_features,):
+            raise ValueError(f"{name} has to have shape ({num_features},), got {vector.shape}")
     eps = jnp.finfo(features.dtype).eps
     is_weighted = (weights > 0)[:, None]
     total = jnp.sum(weights)

@@ -12,7 +12,7 @@ from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
 __all__ = ["Minimum", "minimise"]
 
 _NUM_TRIALS = 6
-"""Step lengths tried at once: 1, 1/2, ..., 1/2048 of the Newton step."""
+"""Step lengths tried at once: 1, 1/4, ..., 1/1024 of the Newton step."""
 _FLAT = 1e-6
 """Least curvature of an axis, as a share of the largest: what float32 tells from rounding."""
 _NO_CURVATURE = 1e-12

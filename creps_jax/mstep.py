@@ -18,9 +18,9 @@ from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
 
 __all__ = ["MStep", "WeightedSamples", "bounded_ml", "weighted_ml"]
 
-_LEAST_EXCITATION = 1e-3
-"""Size, relative to its scale, below which a direction of the features counts as that large in the bound."""
-_LOG_MULTIPLIERS = (-12.0, 18.0)
+_LEAST_EXCITATION = 3e-5
+"""Size, for features of mean square one, below which a direction counts as that large in the bound."""
+_LOG_MULTIPLIERS = (-12.0, 40.0)
 """Range of the logarithms of the multipliers: below, a bound changes nothing; above, nothing moves."""
 _NUM_TRIALS, _NUM_REFINEMENTS = 32, 4
 
@@ -32,7 +32,7 @@ class WeightedSamples(NamedTuple):
     """Policy features of the context of each sample."""
     theta: Float[Array, "n d"]
     weights: Float[Array, " n"]
-    """Weights d, which sum to one; zero where a sample does not count."""
+    """Weights d, which sum to one; a sample of weight zero may hold anything."""
     is_valid: Bool[Array, " n"]
     """Which samples count: over their contexts relative entropies are averaged."""
 
@@ -65,8 +65,9 @@ def bounded_ml(*, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05) -> MSt
 
     The mean that is likeliest within its bound, at the old covariance, is, in features that are uncorrelated
     over the contexts and along the eigenvectors of their weighted mean square g, a share `g / (g + l)` of
-    the whole way, with a multiplier l. The covariance that is likeliest within its bound is, along the
-    eigenvectors of the weighted covariance s, the root x of `l x^2 - (l - 1) x - s = 0`.
+    the whole way, with a multiplier l. The whole way is that of `weighted_ml`, with its ridge. The covariance
+    that is likeliest within its bound is, along the eigenvectors of the weighted covariance s (made unbiased
+    as in Eq. 15), the root x of `l x^2 - (l - 1) x - s = 0`. No spread falls below the rounding of theta.
 
     Args:
         mean_kl_bound: Largest part of the mean in the relative entropy, nats.
@@ -119,7 +120,7 @@ def _bounded_mean(
     def kl(multiplier: Array) -> Array:
         return jnp.sum(share(multiplier) ** 2 * squares)
 
-    moved = exact_dot(axes, share(_least_multiplier(kl, kl_bound))[:, None] * way)
+    moved = exact_dot(axes, share(_least_multiplier(kl, kl_bound, policy.coef.dtype))[:, None] * way)
     moved = jax.scipy.linalg.solve_triangular(basis, moved)
     return policy.coef + exact_dot(moved, policy.cov_chol.T)
 
@@ -129,14 +130,15 @@ def _uncorrelated(samples: WeightedSamples) -> tuple[Array, Array]:
 
     The features are these rows times the basis, which is upper triangular.
     """
-    features = jnp.where(samples.is_valid[:, None], samples.features, 0.0)
-    root_count = jnp.sqrt(jnp.maximum(jnp.sum(samples.is_valid, dtype=features.dtype), 1.0))
-    size = jnp.max(jnp.abs(features))
-    floor = (
-        _LEAST_EXCITATION * jnp.where(size > 0, size, 1.0) * jnp.eye(features.shape[1], dtype=features.dtype)
-    )
-    basis = jnp.linalg.qr(jnp.concatenate([features / root_count, floor]), mode="r")
-    return jax.scipy.linalg.solve_triangular(basis.T, features.T, lower=True).T, basis
+    counts = samples.is_valid & jnp.all(jnp.isfinite(samples.features), axis=1)
+    features = jnp.where(counts[:, None], samples.features, 0.0)
+    features = features / jnp.sqrt(jnp.maximum(jnp.sum(counts, dtype=features.dtype), 1.0))
+    size = jnp.linalg.norm(features, axis=0)
+    size = jnp.where(size > 0, size, 1.0)
+    floor = _LEAST_EXCITATION * jnp.eye(features.shape[1], dtype=features.dtype)
+    basis = jnp.linalg.qr(jnp.concatenate([features / size[None, :], floor]), mode="r") * size[None, :]
+    rows = jnp.where(counts[:, None], samples.features, 0.0)
+    return jax.scipy.linalg.solve_triangular(basis.T, rows.T, lower=True).T, basis
 
 
 def _bounded_cov_chol(
@@ -145,7 +147,8 @@ def _bounded_cov_chol(
     """Go from the old covariance towards the weighted one about the new mean, as far as the bound allows."""
     features, theta, weights, _ = samples
     counts = (weights > 0)[:, None]
-    residual = jnp.where(counts, theta - exact_dot(features, coef), 0.0)
+    features, theta = (jnp.where(counts, x, 0.0) for x in (features, theta))
+    residual = theta - exact_dot(features, coef)
     residual = jax.scipy.linalg.solve_triangular(policy.cov_chol, residual.T, lower=True).T
     # Z of Eq. (15); a single sample makes it zero.
     normaliser = jnp.maximum(1.0 - jnp.sum(weights**2), jnp.finfo(theta.dtype).eps)
@@ -163,16 +166,20 @@ def _bounded_cov_chol(
         y = change(multiplier)
         return 0.5 * jnp.sum(y - jnp.log1p(y))
 
-    x = 1.0 + change(_least_multiplier(kl, kl_bound))
-    root = policy.cov_chol @ (axes * jnp.sqrt(x)[None, :])
+    x = 1.0 + change(_least_multiplier(kl, kl_bound, policy.coef.dtype))
+    root = exact_dot(policy.cov_chol, axes * jnp.sqrt(x)[None, :])
     upper = jnp.linalg.qr(root.T, mode="r")
-    return upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
+    cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
+    # Below the rounding of theta a spread means nothing, and would shrink to zero.
+    least = 4.0 * jnp.finfo(theta.dtype).eps * jnp.max(jnp.abs(theta), axis=0)
+    cov_chol = cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]
+    return jnp.where(jnp.any(counts), cov_chol, policy.cov_chol)
 
 
-def _least_multiplier(kl: Callable[[Array], Scalar], kl_bound: float) -> Array:
+def _least_multiplier(kl: Callable[[Array], Scalar], kl_bound: float, dtype: jnp.dtype) -> Array:
     """Return the least multiplier at which a relative entropy, which falls with it, is within its bound."""
-    low, high = (jnp.float32(end) for end in _LOG_MULTIPLIERS)
-    shares = jnp.linspace(0.0, 1.0, _NUM_TRIALS + 1, dtype=jnp.float32)
+    low, high = (jnp.asarray(end, dtype) for end in _LOG_MULTIPLIERS)
+    shares = jnp.linspace(0.0, 1.0, _NUM_TRIALS + 1, dtype=dtype)
 
     # Many values at once and few rounds of them: small operations cost more than large ones.
     def refine(ends: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:

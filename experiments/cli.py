@@ -147,7 +147,8 @@ def _say(line: str) -> None:
 
 def _list(_: List) -> int:
     width = max(map(len, registry.DESCRIPTIONS))
-    for name, description in registry.DESCRIPTIONS.items():
+    every = {**registry.DESCRIPTIONS, registry.ALL: f"run {', '.join(registry.FIGURES)} (Figures 5 to 9)"}
+    for name, description in every.items():
         print(f"{name:{width}}  {description}")
     return 0
 
@@ -183,6 +184,11 @@ def _run(command: Run) -> int:
 def _run_all(command: Run) -> int:
     if command.resume or command.speed is not None:
         raise UserError("--resume and --speed go with one experiment, not with all")
+    for name in registry.FIGURES:
+        if command.preset is not None:
+            registry.preset_settings(registry.load(name), command.preset)
+        if command.out is not None and (command.out / name).exists():
+            raise UserError(f"{command.out / name} is there already, name another folder")
     for name in registry.FIGURES:
         _run(dataclasses.replace(command, name=name, out=command.out and command.out / name))
     return 0

@@ -103,7 +103,7 @@ def compare(
     """
     # Rollouts as short as these are not worth sharing out, trials are.
     devices = jax.local_devices()
-    devices = devices if settings.trials % len(devices) == 0 else devices[:1]
+    devices = devices[: max(num for num in range(1, len(devices) + 1) if settings.trials % num == 0)]
     plan = Plan(settings.iterations, settings.samples)
     learn_key, evaluate_key = jax.random.split(key)
     evaluated = np.unique(np.linspace(1, plan.iterations, NUM_EVALUATED).round().astype(int))

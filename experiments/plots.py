@@ -1,5 +1,6 @@
 """Draw figures in one style: learning curves, and what a policy does and reaches for each context."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullLocator
 
-COLOURS = ("#0b6e99", "#d1495b", "#edae49", "#3d7a4f", "#7a5195")
+COLOURS = ("#0b6e99", "#d1495b", "#edae49", "#3d7a4f", "#7a5195", "#2f9e8f")
 PAPER_COLOUR = "#8a8a8a"
 FALL_COLOUR = "#d1495b"
 
 TRACES = {
-    "kl": ("KL of the weights (nats)", True),
+    "kl": ("KL of the weights (nats)", False),
     "policy_kl": ("KL of the policy (nats)", True),
     "entropy": ("entropy of the policy (nats)", False),
     "effective_samples": ("effective samples", True),
@@ -137,11 +138,13 @@ def learning_curves(
     rows = math.ceil(len(panels) / columns)
     width = 6.4 if len(panels) == 1 else min(5.0, 14.0 / columns + 0.5) * columns
     figure, grid = new_figure(rows, columns, width=width, height=3.4 * rows + 0.6, sharex=share, sharey=share)
+    labels = dict.fromkeys(label for curves in panels.values() for label in curves)
+    colours = dict(zip(labels, itertools.cycle(COLOURS), strict=False))
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
         for label, (episodes, rewards) in curves.items():
-            plot_learning_curve(axes, episodes, rewards, label)
+            plot_learning_curve(axes, episodes, rewards, label, colour=colours[label])
         for label, value in (references or {}).items():
             axes.axhline(value, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label=label)
         axes.set(xlabel="episodes", title=title)
@@ -172,6 +175,9 @@ def update_traces(episodes: np.ndarray, traces: Mapping[str, Mapping[str, np.nda
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
         if is_log:
             axes.set_yscale("log")
+    # At the bound its rounding would fill the axes.
+    grid[0, 0].set_ylim(bottom=0.0)
+    grid[0, 0].margins(y=0.3)
     grid[0, 0].legend(loc="best", fontsize=8)
     return figure
 

@@ -95,6 +95,41 @@ def test_nothing_likelier_is_within_the_bounds(key):
     np.testing.assert_allclose(new.cov_chol, factor(best), rtol=0.01, atol=0.01)
 
 
+@pytest.mark.parametrize(("unit", "zero"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 300.0)])
+def test_an_active_bound_does_not_know_the_units_of_the_context(key, unit, zero):
+    policy, samples = make_problem(key)
+    contexts = samples.features[:, 1]
+    change = np.array([[1.0, zero], [0.0, unit]])
+    other_policy = policy._replace(coef=jnp.float32(np.linalg.solve(change, np.float64(policy.coef))))
+    features = jnp.stack([jnp.ones(60), unit * contexts + zero], axis=1)
+    other = bounded_ml()(other_policy, samples._replace(features=features), ridge=RIDGE)
+    new = bounded_ml()(policy, samples, ridge=RIDGE)
+    spread = np.linalg.norm(policy.cov_chol, axis=1)
+    means = np.float64(samples.features) @ np.float64(new.coef)
+    np.testing.assert_allclose(
+        (np.float64(features) @ np.float64(other.coef) - means) / spread, 0.0, atol=0.03
+    )
+
+
+@pytest.mark.parametrize("distance", [1.0, 1e3])
+def test_bounds_hold_for_one_sample_with_all_the_weight_and_for_samples_far_away(key, distance):
+    policy, samples = make_problem(key)
+    alone = samples._replace(weights=jnp.zeros(60).at[3].set(1.0), theta=distance * samples.theta)
+    new = bounded_ml(mean_kl_bound=0.1, cov_kl_bound=0.05)(policy, alone, ridge=RIDGE)
+    mean, cov = parts(new, policy, alone)
+    assert mean <= 0.1 * 1.01 and cov <= 0.05 * 1.01
+
+
+def test_a_covariance_does_not_shrink_to_nothing_nor_without_samples(key):
+    policy, samples = make_problem(key)
+    same = samples._replace(theta=jnp.ones((60, 4)))
+    for _ in range(300):
+        policy = bounded_ml(cov_kl_bound=2.0)(policy, same, ridge=RIDGE)
+    assert (jnp.diagonal(policy.cov_chol) > 0).all()
+    new = bounded_ml()(policy, samples._replace(weights=jnp.zeros(60)), ridge=RIDGE)
+    np.testing.assert_array_equal(new.cov_chol, policy.cov_chol)
+
+
 @pytest.mark.parametrize("m_step", [weighted_ml, bounded_ml()], ids=["weighted_ml", "bounded_ml"])
 def test_units_of_parameters_and_contexts_do_not_matter(key, m_step):
     policy, samples = make_problem(key)
@@ -128,15 +163,29 @@ def test_what_does_not_count_is_not_looked_at(key):
     policy, samples = make_problem(key)
     m_step = bounded_ml()
     alone = m_step(policy, samples, ridge=RIDGE)
-    junk = jnp.full((5, 4), 1e6)
+    junk = jnp.full((5, 4), jnp.nan)
     padded = WeightedSamples(
         jnp.concatenate([samples.features, junk[:, :2]]),
         jnp.concatenate([samples.theta, junk]),
         jnp.concatenate([samples.weights, jnp.zeros(5)]),
-        jnp.concatenate([samples.is_valid, jnp.zeros(5, bool)]),
+        jnp.concatenate([samples.is_valid, jnp.ones(5, bool)]),
     )
     for left, right in zip(alone, m_step(policy, padded, ridge=RIDGE), strict=True):
         np.testing.assert_allclose(left, right, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("m_step", [weighted_ml, bounded_ml()], ids=["weighted_ml", "bounded_ml"])
+def test_a_ridge_does_not_wear_a_good_policy_down(key, m_step):
+    policy, samples = make_problem(key, num=200)
+    policy = policy._replace(cov_chol=1e-3 * policy.cov_chol)
+    good = policy
+    for update in range(30):
+        noise = jax.random.normal(jax.random.fold_in(key, update), (200, 4)) @ policy.cov_chol.T
+        theta = samples.features @ policy.coef + noise
+        same = samples._replace(theta=theta, weights=jnp.full(200, 1 / 200))
+        policy = m_step(policy, same, ridge=0.1)
+    # A tenth of the slope in each of 30 updates would leave nothing; the noise moves it by far less.
+    np.testing.assert_allclose(policy.coef, good.coef, atol=0.02 * float(jnp.abs(good.coef).max()))
 
 
 @pytest.mark.parametrize("bounds", [(0.0, 0.1), (1.0, -1.0), (1.0, float("nan"))])

@@ -154,6 +154,16 @@ def test_a_policy_is_not_wild_where_there_were_no_contexts(key):
     assert everywhere.min() > -0.5 and everywhere.max() < 1.5
 
 
+@pytest.mark.parametrize("seen", [[0.1], [0.1, 0.3]])
+def test_a_policy_of_one_or_two_contexts_is_not_wild_elsewhere(seen):
+    rbf = rbf_features(0.0, 1.0, 5)
+    features = jax.vmap(rbf.apply)(jnp.array(seen * 20)[:, None])
+    theta = 1.0 + 0.01 * jax.random.normal(jax.random.key(0), (len(features), 1))
+    found = fit(features, theta, jnp.ones(len(features)), ridge=1e-4, scale=jnp.asarray(rbf.scale))
+    everywhere = jax.vmap(rbf.apply)(jnp.linspace(0.0, 1.0, 21)[:, None]) @ found.coef
+    np.testing.assert_allclose(everywhere, 1.0, atol=0.3)
+
+
 @pytest.mark.parametrize("shift", [0.0, 100.0])
 def test_ridge_does_not_care_for_the_zero_of_the_context(shift, key):
     contexts = jax.random.uniform(key, (200, 1))

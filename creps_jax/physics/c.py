@@ -16,14 +16,16 @@ from creps_jax.typing import Array, Float
 
 __all__ = ["make_control_step"]
 
-_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
+_LARGEST = 1e10
+"""A state beyond this is taken for bad, as C MuJoCo takes it."""
 
 
 def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     """Return the function that steps the robot through one control step, on the host's cores.
 
     It does what `creps_jax.physics.mjx.make_control_step` does, but for rounding. A `jax.vmap` of it is one
-    call for the whole batch. A robot whose state or set-points are not finite gets a state of NaN.
+    call for the whole batch. A robot whose state or set-points are not finite, or that C MuJoCo finds
+    unstable (which it also writes to its log, MUJOCO_LOG.TXT), gets a state of NaN. There are no gradients.
 
     Args:
         model: A model all of whose actuators are position servos on joints.
@@ -59,14 +61,17 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
         qpos, qvel, warmstart, before, after, speed = np.split(rows, np.cumsum(sizes)[:-1], axis=1)
         control = before[:, None] + shares * (after - before)[:, None] + (lead * speed)[:, None]
         start = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
-        is_lost = ~(np.isfinite(start).all(axis=1) & np.isfinite(control).all(axis=(1, 2)))
+        is_lost = ~((np.abs(start) <= _LARGEST).all(axis=1) & np.isfinite(control).all(axis=(1, 2)))
         for array, stand_in in ((start, np.append(0.0, rest)), (control, 0.0), (warmstart, 0.0)):
             array[is_lost] = stand_in
         with _borrowed(idle, make) as (pool, data):
             states, _ = pool.rollout(model, data, start, control, initial_warmstart=warmstart)
+        # Where C finds a robot unstable its time stands still, and so does the rest of the state.
+        is_lost |= states[:, -1, 0] < (num_substeps - 0.5) * model.opt.timestep
+        is_lost |= ~(np.abs(states[:, -1]) <= _LARGEST).all(axis=1)
         states[is_lost] = np.nan
         end = states[:, -1, 1 + model.nq :]
-        # The solver starts from the last acceleration, which the states tell by their velocities.
+        # The solver starts near the last acceleration; what the velocities tell of it is a good guess.
         earlier = states[:, -2, 1 + model.nq :] if num_substeps > 1 else qvel
         moved = [states[:, -1, 1:], (end - earlier) / model.opt.timestep]
         return np.concatenate(moved, axis=1, dtype=np.float32).reshape(*packed.shape[:-1], -1)

@@ -51,7 +51,7 @@ def contextual_function(
         return PlainOutcome(-function(moved), jnp.zeros(0, theta.dtype))
 
     sample_context = uniform_contexts((low,) * context_dim, (high,) * context_dim)
-    return Task(sample_context, rollout, context_dim, theta_dim, worst_reward=-1e9)
+    return Task(sample_context, rollout, context_dim, theta_dim, worst_reward=-1e30)
 
 
 def sphere(x: Float[Array, " d"]) -> Scalar:

@@ -26,7 +26,7 @@ TASKS = {
 @pytest.mark.parametrize("trials", [2, 20])
 @pytest.mark.parametrize("name", TASKS)
 def test_whole_run(benchmark, name, trials):
-    """All iterations of a figure's curve; for the hole, 20 trials in at most 3 minutes are asked for."""
+    """All iterations of a figure's curve."""
     task, features, experiment = TASKS[name]
     settings = dataclasses.replace(experiment.SETTINGS["paper"], trials=trials)
     contender = make_contender(task, (features, features), settings)

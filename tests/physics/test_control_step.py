@@ -88,7 +88,8 @@ def test_another_solver_or_integrator_is_an_error(option, match):
         mjx.make_control_step(mujoco.MjModel.from_xml_string(xml), 4)
 
 
-def test_c_steps_a_batch_of_any_shape_from_any_state(model):
+def test_c_steps_a_batch_of_any_shape_from_any_state(model, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # C writes its log there.
     control_step = c.make_control_step(model, 5)
     still = jnp.zeros(model.nu)
     state = initial_state(jnp.asarray(model.key("stand").qpos, jnp.float32), model.nv)
@@ -104,6 +105,11 @@ def test_c_steps_a_batch_of_any_shape_from_any_state(model):
     moved = jax.jit(batch)(lost, still, still, still)
     np.testing.assert_array_equal(moved.qpos[1, 2], alone.qpos)
     assert jnp.isnan(moved.qpos[0, 0]).all()
+    for speed in (1e7, 1e12, 1e30):
+        wild = states._replace(qvel=states.qvel.at[0, 0].set(speed))
+        moved = jax.jit(batch)(wild, still, still, still)
+        assert jnp.isnan(moved.qpos[0, 0]).all()
+        np.testing.assert_array_equal(moved.qpos[1, 2], alone.qpos)
     commands = jnp.zeros((3, model.nu)).at[1, 0].set(jnp.nan)
     one_row = jax.tree.map(lambda x: x[0], states)
     moved = jax.jit(jax.vmap(control_step))(one_row, commands, commands, commands)
