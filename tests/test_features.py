@@ -24,7 +24,9 @@ def test_protocol(name, key):
     np.testing.assert_allclose(jax.jit(features.apply)(context), row, rtol=1e-6)
     if features.scale is not None:
         far = jax.vmap(features.apply)(100.0 * jax.random.normal(key, (200, 2)))
-        np.testing.assert_allclose(jnp.abs(far).max(0), features.scale, rtol=0.01)
+        assert (jnp.abs(far) <= jnp.asarray(features.scale)[None]).all()
+        # The outermost features get that large.
+        np.testing.assert_allclose(jnp.abs(far).max(), max(features.scale), rtol=1e-3)
     rows = jax.vmap(features.apply)(jnp.stack([context, 2 * context]))
     np.testing.assert_allclose(rows[0], row, rtol=1e-6)
     with pytest.raises(ValueError, match=r"shape \(2,\), got \(3,\)"):

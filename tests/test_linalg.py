@@ -114,7 +114,7 @@ def test_weighted_ridge_leaves_the_free_direction_unpenalised():
 
 
 def test_weighted_ridge_holds_a_feature_that_could_be_large_but_is_not():
-    features = jnp.ones((50, 2)).at[:, 1].set(1e-4 * jnp.arange(50) / 50)
+    features = jnp.ones((50, 2)).at[:, 1].set(jnp.linspace(0.0, 1e-4, 50))
     targets = features[:, 1:] * 1e4
     wild = weighted_ridge(features, targets, jnp.ones(50), ridge=1e-4)
     held = weighted_ridge(features, targets, jnp.ones(50), ridge=1e-4, scale=jnp.ones(2))

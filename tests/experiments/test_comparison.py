@@ -75,7 +75,8 @@ def test_updates_are_compared_on_the_same_problem(monkeypatch, tmp_path):
     np.testing.assert_array_equal(first[0], first[2])
     # The unbounded fit moves by many nats, the bounded one by what it may.
     assert arrays["sphere/sphere-plain.policy_kl"].min() > 5.0
-    np.testing.assert_allclose(arrays["sphere/sphere-bounded.policy_kl"], 1.05, rtol=0.01)
+    moved = arrays["sphere/sphere-bounded.policy_kl"]
+    assert moved.max() == pytest.approx(1.05, rel=0.01)
     assert updates.share_of_episodes(arrays, "sphere") <= 1.0
     assert set(updates.plot(arrays)) == {"learning_curves", "sphere_updates"}
     updates.finish(settings, arrays, tmp_path, said.append)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from creps_jax.motion.walking.posture import Balance
-from creps_jax.physics import c
+from creps_jax.physics import c, mjx
 from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, _make_walker, load_nao, nao_walk, record_walk
 from tests.oracles import walk_c
 
@@ -102,7 +102,7 @@ def test_speed_and_falls_agree_with_c_mujoco(outcome):
 
 def _start_of(theta):
     """Return the position in which a walk begins, without noise."""
-    begin, _ = _make_walker(None, 0.1, WalkNoise(0.0, 0.0, 0.0), Balance())
+    begin, _ = _make_walker(None, 0.1, WalkNoise(0.0, 0.0, 0.0), Balance(), mjx.make_control_step)
     return np.asarray(begin(jax.random.key(0), theta).robot.qpos, float)
 
 
