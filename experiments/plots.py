@@ -176,8 +176,8 @@ def update_traces(episodes: np.ndarray, traces: Mapping[str, Mapping[str, np.nda
         if is_log:
             axes.set_yscale("log")
     # At the bound its rounding would fill the axes.
-    grid[0, 0].set_ylim(bottom=0.0)
-    grid[0, 0].margins(y=0.3)
+    highest = max(np.nanmax(fields[next(iter(TRACES))]) for fields in traces.values())
+    grid[0, 0].set_ylim(0.0, 1.5 * highest + 1e-9)
     grid[0, 0].legend(loc="best", fontsize=8)
     return figure
 
