@@ -1,5 +1,7 @@
 """The bounded fit keeps its bounds, is the best within them, and knows no units."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -123,8 +125,10 @@ def test_bounds_hold_for_one_sample_with_all_the_weight_and_for_samples_far_away
 def test_a_covariance_does_not_shrink_to_nothing_nor_without_samples(key):
     policy, samples = make_problem(key)
     same = samples._replace(theta=jnp.ones((60, 4)))
+    # Compiled once, or each of the many updates would be.
+    update = jax.jit(partial(bounded_ml(cov_kl_bound=2.0), ridge=RIDGE))
     for _ in range(300):
-        policy = bounded_ml(cov_kl_bound=2.0)(policy, same, ridge=RIDGE)
+        policy = update(policy, same)
     assert (jnp.diagonal(policy.cov_chol) > 0).all()
     new = bounded_ml()(policy, samples._replace(weights=jnp.zeros(60)), ridge=RIDGE)
     np.testing.assert_array_equal(new.cov_chol, policy.cov_chol)
@@ -178,12 +182,12 @@ def test_what_does_not_count_is_not_looked_at(key):
 def test_a_ridge_does_not_wear_a_good_policy_down(key, m_step):
     policy, samples = make_problem(key, num=200)
     policy = policy._replace(cov_chol=1e-3 * policy.cov_chol)
-    good = policy
+    good, m_step = policy, jax.jit(partial(m_step, ridge=0.1))
     for update in range(30):
         noise = jax.random.normal(jax.random.fold_in(key, update), (200, 4)) @ policy.cov_chol.T
         theta = samples.features @ policy.coef + noise
         same = samples._replace(theta=theta, weights=jnp.full(200, 1 / 200))
-        policy = m_step(policy, same, ridge=0.1)
+        policy = m_step(policy, same)
     # A tenth of the slope in each of 30 updates would leave nothing; the noise moves it by far less.
     np.testing.assert_allclose(policy.coef, good.coef, atol=0.02 * float(jnp.abs(good.coef).max()))
 
