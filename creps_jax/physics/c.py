@@ -1,7 +1,6 @@
 """Step a robot with position servos by C MuJoCo, one control step of the whole batch at a time."""
 
 import contextlib
-import copy
 import os
 
 import jax
@@ -40,9 +39,6 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     if num_substeps < 1:
         raise ValueError(f"num_substeps must be at least 1, got {num_substeps}")
     servos = read_servos(model)
-    # C would stand a robot up again whose state has become bad, and it would walk on as if nothing had been.
-    model = copy.copy(model)
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     shares = (np.arange(1, num_substeps + 1) / num_substeps)[:, None]
     # So far ahead of the set-point, a servo's damping against the speed of the set-point costs it nothing.
     lead = servos.damping / servos.stiffness
@@ -66,7 +62,7 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
             array[is_lost] = stand_in
         with _borrowed(idle, make) as (pool, data):
             states, _ = pool.rollout(model, data, start, control, initial_warmstart=warmstart)
-        # Where C finds a robot unstable its time stands still, and so does the rest of the state.
+        # C stands a robot up again whose state has become bad, with a new time, and leaves it there.
         is_lost |= states[:, -1, 0] < (num_substeps - 0.5) * model.opt.timestep
         is_lost |= ~(np.abs(states[:, -1]) <= _LARGEST).all(axis=1)
         states[is_lost] = np.nan
