@@ -14,6 +14,7 @@ __all__ = [
     "exact_dot",
     "safe_cholesky",
     "thomas_solve",
+    "unbiased_normaliser",
     "weighted_ridge",
     "whitening",
 ]
@@ -140,6 +141,20 @@ def weighted_ridge(
     orthogonal, triangular = jnp.linalg.qr(jnp.concatenate([rows / size[None, :], penalty]))
     projected = exact_dot(orthogonal[:num_samples].T, values)
     return jax.scipy.linalg.solve_triangular(triangular, projected) / size[:, None]
+
+
+def unbiased_normaliser(weights: Float[Array, " n"]) -> Float[Array, ""]:
+    """Return what makes a weighted covariance unbiased, for weights that sum to one.
+
+    Args:
+        weights: Weights d of the samples, not negative.
+
+    Returns:
+        Z = 1 - sum d^2; not the zero that a single sample makes it, but the resolution of the format.
+
+    Source: Abdolmaleki et al. 2016, Eq. 15.
+    """
+    return jnp.maximum(1.0 - jnp.sum(weights**2), jnp.finfo(weights.dtype).eps)
 
 
 def safe_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:

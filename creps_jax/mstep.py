@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from creps_jax.linalg import exact_dot
+from creps_jax.linalg import exact_dot, unbiased_normaliser
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
 from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
 
@@ -134,7 +134,7 @@ def _uncorrelated(samples: WeightedSamples) -> tuple[Array, Array]:
     features = jnp.where(counts[:, None], samples.features, 0.0)
     features = features / jnp.sqrt(jnp.maximum(jnp.sum(counts, dtype=features.dtype), 1.0))
     size = jnp.linalg.norm(features, axis=0)
-    size = jnp.where(size > 0, size, 1.0)
+    size = jnp.asarray(jnp.where(size > 0, size, 1.0))
     floor = _LEAST_EXCITATION * jnp.eye(features.shape[1], dtype=features.dtype)
     basis = jnp.linalg.qr(jnp.concatenate([features / size[None, :], floor]), mode="r") * size[None, :]
     rows = jnp.where(counts[:, None], samples.features, 0.0)
@@ -150,9 +150,7 @@ def _bounded_cov_chol(
     features, theta = (jnp.where(counts, x, 0.0) for x in (features, theta))
     residual = theta - exact_dot(features, coef)
     residual = jax.scipy.linalg.solve_triangular(policy.cov_chol, residual.T, lower=True).T
-    # Z of Eq. (15); a single sample makes it zero.
-    normaliser = jnp.maximum(1.0 - jnp.sum(weights**2), jnp.finfo(theta.dtype).eps)
-    scatter = exact_dot(residual.T, weights[:, None] * residual) / normaliser
+    scatter = exact_dot(residual.T, weights[:, None] * residual) / unbiased_normaliser(weights)  # Eq. (15)
     spread, axes = jnp.linalg.eigh(0.5 * (scatter + scatter.T))
     excess = jnp.maximum(spread, 0.0) - 1.0
 

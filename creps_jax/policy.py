@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from creps_jax.linalg import exact_dot, safe_cholesky, weighted_ridge
+from creps_jax.linalg import exact_dot, safe_cholesky, unbiased_normaliser, weighted_ridge
 from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike
 
 __all__ = ["LinearGaussian", "entropy", "fit_weighted_ml", "kl", "log_prob", "mean", "sample"]
@@ -163,7 +163,7 @@ def fit_weighted_ml(
 
     size = jnp.max(jnp.abs(theta), axis=0)
     start = jnp.zeros((features.shape[1], theta.shape[1]), theta.dtype) if start is None else start
-    theta = jnp.where(is_weighted[:, None], theta - exact_dot(features, start), 0.0)
+    theta = theta - exact_dot(features, start)
     centre = exact_dot(weights, theta)
     ones = jnp.ones((theta.shape[0], 1), theta.dtype)
     # The features' nearest to a constant. Of features that sum to one it is that sum, wherever samples are.
@@ -196,8 +196,7 @@ def _weighted_cov_chol(
     the spread of each parameter. A parameter without spread gets that of its rounding, from its `size`.
     """
     eps = jnp.finfo(residual.dtype).eps
-    # Z of Eq. (15); a single sample makes it zero.
-    normaliser = jnp.maximum(1.0 - jnp.sum(weights**2), eps)
+    normaliser = unbiased_normaliser(weights)
     spread = jnp.sqrt(exact_dot(weights, residual**2) / normaliser)
     spread = jnp.maximum(spread, 4.0 * eps * jnp.where(size > 0, size, 1.0))
     unit = residual / spread[None, :]

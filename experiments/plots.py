@@ -147,8 +147,7 @@ def learning_curves(
             plot_learning_curve(axes, episodes, rewards, label, colour=colours[label])
         for label, value in (references or {}).items():
             axes.axhline(value, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label=label)
-        axes.set(xlabel="episodes", title=title)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        _over_episodes(axes, title)
         axes.legend(loc="lower right", fontsize=10 if columns < 3 else 7)
         if not share:
             reward_scale(axes, [rewards for _, rewards in curves.values()])
@@ -171,8 +170,7 @@ def update_traces(episodes: np.ndarray, traces: Mapping[str, Mapping[str, np.nda
     for axes, (field, (label, is_log)) in zip(grid[0], TRACES.items(), strict=True):
         for name, fields in traces.items():
             plot_learning_curve(axes, episodes, fields[field], name)
-        axes.set(xlabel="episodes", title=label)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        _over_episodes(axes, label)
         if is_log:
             axes.set_yscale("log")
     # At the bound its rounding would fill the axes.
@@ -354,6 +352,11 @@ def plot_ground(axes: Axes, center: float, width: float, depth: float) -> None:
     low, high = axes.get_xlim()
     x = [min(low, -1.0), left, left, right, right, max(high, 3.0)]
     axes.plot(x, [0.0, 0.0, -depth, -depth, 0.0, 0.0], color=FALL_COLOUR, linewidth=1.5)
+
+
+def _over_episodes(axes: Axes, title: str) -> None:
+    axes.set(xlabel="episodes", title=title)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
 
 
 def _mean_of_finite(samples: np.ndarray) -> np.ndarray:

@@ -18,11 +18,10 @@ from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid
 from creps_jax.features import FeatureMap, linear_features, rbf_features
-from creps_jax.policy import LinearGaussian
 from creps_jax.tasks import Task, contextual_function, hole_reaching, sinus, via_point_reaching
 from creps_jax.tasks.functions import ackley, ellipsoid, rastrigin, rosenbrock, sphere
 from experiments import plots, results
-from experiments.comparison import LearnerSettings, compare, make_contender, mean_policy_curve
+from experiments.comparison import Contender, LearnerSettings, compare, make_contender, mean_policy_curve
 from experiments.learning import Session
 from experiments.registry import Claim
 from experiments.tables import to_markdown
@@ -36,6 +35,8 @@ FUNCTIONS = {
     "ackley": ackley,
 }
 THETA_DIM, CONTEXT_DIM = 20, 2
+FUNCTION_KL_BOUNDS = (1.0, 0.05)
+"""How far an update of the bounded fit may move mean and covariance on the functions, nats."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,26 +58,20 @@ SETTINGS = {"best": Settings(), "quick": Settings(trials=4)}
 
 
 class Bench(NamedTuple):
-    """A task, what to learn it with, and how."""
+    """Who learns a task, by fit, and the contexts to judge them on."""
 
-    task: Task
-    features: FeatureMap
+    contenders: Mapping[str, Contender]
     grid: jax.Array
-    start: LinearGaussian
-    learners: Mapping[str, LearnerSettings]
 
 
 def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
     """Learn each task with each fit, from the same first policy and the same keys."""
     setup_key, learn_key = jax.random.split(key)
+    plan = LearnerSettings(settings.iterations, settings.trials, settings.samples)
     arrays = {}
     for name, make in BENCHES.items():
         bench = make(setup_key)
-        contenders = {}
-        for fit, learner in bench.learners.items():
-            contender = make_contender(bench.task, (bench.features, bench.features), learner)
-            contenders[f"{name}-{fit}"] = contender._replace(start=bench.start)
-        plan = LearnerSettings(settings.iterations, settings.trials, settings.samples)
+        contenders = {f"{name}-{fit}": contender for fit, contender in bench.contenders.items()}
         found = compare(contenders, plan, learn_key, grid=bench.grid, session=session)
         arrays |= {f"{name}/{field}": values for field, values in found.items()}
     return arrays
@@ -84,32 +79,38 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
 
 def _function_bench(function: Callable[[jax.Array], jax.Array], key: jax.Array) -> Bench:
     transform_key, start_key = jax.random.split(key)
+    task = contextual_function(function, jax.random.normal(transform_key, (THETA_DIM, CONTEXT_DIM)))
     features = linear_features(CONTEXT_DIM)
     coef = jnp.zeros((features.size, THETA_DIM)).at[0].set(jax.random.normal(start_key, (THETA_DIM,)))
-    return Bench(
-        contextual_function(function, jax.random.normal(transform_key, (THETA_DIM, CONTEXT_DIM))),
-        features,
-        context_grid((1.0, 1.0), (2.0, 2.0), 5),
-        LinearGaussian(coef, jnp.eye(THETA_DIM)),
-        {
-            "plain": LearnerSettings(archive_size=50, kl_bound=1.0, ridge=1e-10),
-            "archive": LearnerSettings(archive_size=1000, kl_bound=1.0, ridge=1e-10),
-            "bounded": LearnerSettings(
-                archive_size=200, kl_bound=1.0, ridge=1e-10, mean_kl_bound=1.0, cov_kl_bound=0.05
-            ),
-        },
-    )
+    learners = {
+        "plain": LearnerSettings(archive_size=50, kl_bound=1.0, ridge=1e-10),
+        "archive": LearnerSettings(archive_size=1000, kl_bound=1.0, ridge=1e-10),
+        "bounded": LearnerSettings(
+            archive_size=200,
+            kl_bound=1.0,
+            ridge=1e-10,
+            mean_kl_bound=FUNCTION_KL_BOUNDS[0],
+            cov_kl_bound=FUNCTION_KL_BOUNDS[1],
+        ),
+    }
+    contenders = {}
+    for fit, learner in learners.items():
+        contender = make_contender(task, (features, features), learner)
+        contenders[fit] = contender._replace(start=contender.start._replace(coef=coef))
+    return Bench(contenders, context_grid((1.0, 1.0), (2.0, 2.0), 5))
 
 
 def _task_bench(
     task: Task, features: FeatureMap, grid: jax.Array, *, start_std: float, cov_kl_bound: float
 ) -> Bench:
-    start = LinearGaussian(jnp.zeros((features.size, task.theta_dim)), start_std * jnp.eye(task.theta_dim))
     learners = {
-        "archive": LearnerSettings(),
-        "bounded": LearnerSettings(archive_size=400, mean_kl_bound=0.3, cov_kl_bound=cov_kl_bound),
+        "archive": LearnerSettings(start_std=start_std),
+        "bounded": LearnerSettings(
+            archive_size=400, mean_kl_bound=0.3, cov_kl_bound=cov_kl_bound, start_std=start_std
+        ),
     }
-    return Bench(task, features, grid, start, learners)
+    pair = (features, features)
+    return Bench({fit: make_contender(task, pair, learner) for fit, learner in learners.items()}, grid)
 
 
 def _sinus_bench(key: jax.Array) -> Bench:
@@ -211,8 +212,7 @@ def _last_samples(arrays: Mapping[str, np.ndarray], contender: str) -> float:
 
 def _largest_move(arrays: Mapping[str, np.ndarray]) -> float:
     """Return the largest relative entropy of the bounded fit on the sphere, as a share of its bound."""
-    bound = 1.0 + 0.05
-    return float(of_bench(arrays, "sphere")["sphere-bounded.policy_kl"].max() / bound)
+    return float(of_bench(arrays, "sphere")["sphere-bounded.policy_kl"].max() / sum(FUNCTION_KL_BOUNDS))
 
 
 CLAIMS = (

@@ -10,7 +10,7 @@ import numpy as np
 from mujoco import rollout
 
 from creps_jax.physics.servos import read_servos
-from creps_jax.physics.state import ControlStep, RobotState
+from creps_jax.physics.state import ControlStep, RobotState, substep_shares
 from creps_jax.typing import Array, Float
 
 __all__ = ["make_control_step"]
@@ -36,12 +36,8 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     Raises:
         ValueError: If an actuator is no plain position servo on a joint, or there is no substep.
     """
-    if num_substeps < 1:
-        raise ValueError(f"num_substeps must be at least 1, got {num_substeps}")
-    servos = read_servos(model)
-    shares = (np.arange(1, num_substeps + 1) / num_substeps)[:, None]
-    # So far ahead of the set-point, a servo's damping against the speed of the set-point costs it nothing.
-    lead = servos.damping / servos.stiffness
+    shares = substep_shares(num_substeps)[:, None]
+    lead = read_servos(model).lead
     rest = np.append(model.qpos0, np.zeros(model.nv))
     # Devices call at the same time, each from threads that come and go.
     idle = []

@@ -9,7 +9,7 @@ from jax.scipy.linalg import cho_factor, cho_solve
 from mujoco import mjx
 
 from creps_jax.physics.servos import Servos, read_servos
-from creps_jax.physics.state import ControlStep, RobotState
+from creps_jax.physics.state import ControlStep, RobotState, substep_shares
 from creps_jax.typing import Array, Float
 
 __all__ = ["make_control_step"]
@@ -36,8 +36,7 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
         ValueError: If an actuator is no plain position servo on a joint, integrator or solver is another,
             or there is no substep.
     """
-    if num_substeps < 1:
-        raise ValueError(f"num_substeps must be at least 1, got {num_substeps}")
+    shares = substep_shares(num_substeps)
     step = _make_step(model)
 
     def control_step(
@@ -49,8 +48,7 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
         def substep(state, share):
             return step(state, before + share * (after - before), speed), None
 
-        shares = jnp.arange(1, num_substeps + 1, dtype=before.dtype) / num_substeps
-        return lax.scan(substep, state, shares)[0]
+        return lax.scan(substep, state, jnp.asarray(shares, before.dtype))[0]
 
     return control_step
 
@@ -98,8 +96,7 @@ def _make_step(model: mujoco.MjModel) -> Callable[[RobotState, Array, Array], Ro
 
 def _act(servos: Servos, data: mjx.Data, set_point: Array, speed: Array) -> tuple[Array, Array]:
     """Return torques and damping coefficients of the servos, one for each degree of freedom."""
-    # That far ahead, a servo's damping against the speed of the set-point costs it nothing.
-    control = jnp.clip(set_point + servos.damping / servos.stiffness * speed, *servos.control_range)
+    control = jnp.clip(set_point + servos.lead * speed, *servos.control_range)
     wanted = servos.stiffness * (control - data.qpos[servos.qpos_index])
     wanted = wanted - servos.damping * data.qvel[servos.qvel_index]
     torque = jnp.clip(wanted, *servos.torque_range)

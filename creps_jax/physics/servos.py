@@ -29,6 +29,11 @@ class Servos(NamedTuple):
     qpos_index: Int[np.ndarray, " nu"]
     qvel_index: Int[np.ndarray, " nu"]
 
+    @property
+    def lead(self) -> Float[np.ndarray, " nu"]:
+        """How far ahead of a moving set-point its damping costs a servo nothing, s."""
+        return self.damping / self.stiffness
+
 
 def read_servos(model: mujoco.MjModel) -> Servos:
     """Read the servos out of a model.
