@@ -11,6 +11,7 @@ import pytest
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c, mjx
 from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, _make_walker, load_nao, nao_walk, record_walk
+from creps_jax.train import evaluate
 from tests.oracles import walk_c
 
 # Gaits of about .08, .33 and .50 m/s, and one that trips at once.
@@ -23,14 +24,12 @@ DURATION = 4.0
 SEEDS = 4
 
 
-def rolled_out(task, thetas, seeds, asked=0.3, seed=1):
-    thetas = jnp.repeat(jnp.array(thetas), seeds, axis=0)
-    num = len(thetas)
-    keys = jax.random.split(jax.random.key(seed), num)
+def rolled_out(task, thetas, seeds, asked=0.3):
+    contexts = jnp.full((len(thetas), 1), asked)
     # MJX relies on implicit promotion.
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        outcome = jax.jit(jax.vmap(task.rollout, (0, None, 0)))(keys, jnp.array([asked]), thetas)
-    return jax.tree.map(lambda leaf: np.asarray(leaf).reshape(num // seeds, seeds, *leaf.shape[1:]), outcome)
+        outcome = evaluate(jax.random.key(1), task, contexts, jnp.array(thetas), repeats=seeds)
+    return jax.tree.map(np.asarray, outcome)
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +72,10 @@ def test_repeats_differ_by_their_keys_and_a_key_repeats(task, outcome):
 
 @pytest.mark.usefixtures("relaxed_promotion")
 def test_a_record_is_the_same_walk_with_the_speed_of_the_displacement(outcome):
-    keys = jax.random.split(jax.random.key(1), 4 * SEEDS)
-    record = jax.jit(lambda key, theta: record_walk(key, theta, duration=DURATION, balance=BALANCE))(
-        keys[SEEDS], jnp.array(MIDDLE)
-    )
+    # C's program is quickly compiled.
+    settings = {"duration": DURATION, "balance": BALANCE, "physics": c.make_control_step}
+    key = jax.random.fold_in(jax.random.key(1), SEEDS)
+    record = jax.jit(lambda key, theta: record_walk(key, theta, **settings))(key, jnp.array(MIDDLE))
     start = round(2.0 / 0.02) - 1
     np.testing.assert_allclose(record.time[start], 2.0, atol=1e-6)
     displacement = np.asarray(record.qpos[-1, :2] - record.qpos[start, :2])
@@ -155,11 +154,12 @@ def test_another_robot_is_an_error():
 
 
 def test_a_state_that_is_not_finite_ends_the_episode_as_a_failure():
-    broken = nao_walk(
-        duration=0.2, start_up=0.0, noise=WalkNoise(lean=0.01, set_point=float("nan"), start=0.0)
-    )
+    def break_down(*_):
+        return lambda robot, before, after, speed: jax.tree.map(lambda x: x * jnp.nan, robot)
+
+    broken = nao_walk(duration=0.2, start_up=0.0, physics=break_down)
     outcome = rolled_out(broken, [MIDDLE], 1)
-    assert not np.isfinite(outcome.reward).any()
+    assert (outcome.reward == np.float32(broken.worst_reward)).all()
     assert outcome.seconds[0, 0] < 0.2
 
 

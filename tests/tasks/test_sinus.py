@@ -40,9 +40,8 @@ def test_rbf_reps_learns_the_sine_and_linear_reps_does_not(key):
         algorithm = creps(policy_features, baseline_features, archive_size=2000)
         policy = LinearGaussian(jnp.zeros((policy_features.size, 1)), jnp.eye(1))
         keys = jax.random.split(key, 3)
-        # Of 40 samples too few lie near the ends of the range for a first policy of ten features.
-        settings = {"iterations": 40, "samples": 40, "first_samples": 200}
-        states, _ = train_trials(keys, sinus(), algorithm, policy, **settings)
+        # Of fewer samples too few lie near the ends of the range for a first policy of ten features.
+        states, _ = train_trials(keys, sinus(), algorithm, policy, iterations=30, samples=100)
         thetas = jax.vmap(algorithm.mean, (0, None))(states.policy, grid)
         contexts = jnp.tile(grid, (3, 1))
         return evaluate(key, sinus(), contexts, thetas.reshape(-1, 1)).reward.reshape(3, -1).mean(1)
