@@ -1,7 +1,7 @@
 """Weigh samples by contextual relative entropy policy search: the dual function, its minimum, the weights."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,8 @@ from creps_jax.minimise import minimise
 from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
 
 __all__ = ["DualSolution", "dual_objective", "sample_kl", "sample_weights", "solve_dual"]
+
+Prior: TypeAlias = Bool[Array, " n"] | Float[Array, " n"]
 
 _NUM_ROUNDS = 4
 """Most rounds of standardising and minimising, before and after the bound may be given up."""
@@ -48,7 +50,7 @@ def dual_objective(
     baseline_coef: Float[Array, " m"],
     reward: Float[Array, " n"],
     features: Float[Array, "n m"],
-    valid: Bool[Array, " n"],
+    prior: Prior,
     kl_bound: ScalarLike,
 ) -> Scalar:
     """Evaluate the dual function of contextual REPS on samples; convex in (temperature, baseline_coef).
@@ -58,15 +60,16 @@ def dual_objective(
         baseline_coef: Coefficients w of the baseline V(s) = phi(s)' w.
         reward: Reward R of each sample.
         features: Baseline features phi of the context of each sample.
-        valid: Which samples count; what the others hold is never used.
-        kl_bound: Largest relative entropy epsilon between the weights and uniform weights.
+        prior: Which samples count, or how much each does; what those hold that do not is never used.
+        kl_bound: Largest relative entropy epsilon between the weights and the prior.
 
     Returns:
-        g(eta, w) = eta epsilon + mean(phi)' w + eta log mean exp((R - phi' w) / eta).
+        g(eta, w) = eta epsilon + mean(phi)' w + eta log mean exp((R - phi' w) / eta), means under the prior.
 
     Source: Abdolmaleki et al. 2016, Eq. 13.
     """
-    return _dual(log_temperature, baseline_coef, *_mask(reward, features, valid), kl_bound)
+    prior = _check_samples(reward, features, prior)
+    return _dual(log_temperature, baseline_coef, *_mask(reward, features, prior), kl_bound)
 
 
 def _dual(
@@ -74,22 +77,21 @@ def _dual(
     baseline_coef: Array,
     reward: Array,
     features: Array,
-    counts: Array,
+    prior: Array,
     kl_bound: ScalarLike,
 ) -> Scalar:
     """Evaluate the dual function on what `_mask` returns."""
-    num_samples = jnp.sum(counts, dtype=reward.dtype)
     temperature = jnp.exp(log_temperature)
-    mean_features = jnp.sum(features, axis=0) / num_samples
+    mean_features = exact_dot(prior, features)
     advantage = (reward - exact_dot(features, baseline_coef)) / temperature
-    log_mean = logsumexp(advantage, where=counts) - jnp.log(num_samples)
+    log_mean = logsumexp(advantage, b=prior)
     return temperature * kl_bound + exact_dot(mean_features, baseline_coef) + temperature * log_mean
 
 
 def solve_dual(
     reward: Float[Array, " n"],
     features: Float[Array, "n m"],
-    valid: Bool[Array, " n"] | None = None,
+    prior: Prior | None = None,
     *,
     kl_bound: ScalarLike,
 ) -> DualSolution:
@@ -101,23 +103,24 @@ def solve_dual(
     Args:
         reward: Reward R of each sample.
         features: Baseline features phi of the context of each sample.
-        valid: Which samples count; all by default. One whose reward or features are not finite never does.
-        kl_bound: Largest relative entropy epsilon between the weights and uniform weights, above zero.
+        prior: Which samples count, or how much each did before its reward was seen, such as its importance
+            weight; equally by default. One whose reward or features are not finite never counts.
+        kl_bound: Largest relative entropy epsilon between the weights and the prior, above zero.
 
     Returns:
         The solution, finite for any number of samples that count, none included. Where the bound is active,
-        the relative entropy of `sample_weights` equals it and they keep the mean of the features.
+        the relative entropy of `sample_weights` equals it and they keep the prior's mean of the features.
 
     Raises:
         ValueError: If shapes do not fit or `kl_bound` is not a positive number.
 
     Source: Abdolmaleki et al. 2016, Eq. 12 and 13.
     """
-    valid = _check_samples(reward, features, valid)
+    prior = _check_samples(reward, features, prior)
     if not isinstance(kl_bound, Tracer) and not 0.0 < float(kl_bound) < math.inf:
         raise ValueError(f"kl_bound has to be a positive number, got {kl_bound}")
     kl_bound = jnp.asarray(kl_bound, reward.dtype)
-    samples, unit = _standardise(reward, features, valid)
+    samples, unit = _standardise(reward, features, prior)
 
     guess = _search(samples, kl_bound)
     solution = DualSolution(
@@ -128,11 +131,10 @@ def solve_dual(
         is_active=guess.is_active,
     )
     # The quality is that of the weights as the caller gets them, with the rounding of the solution.
-    weights = sample_weights(solution, reward, features, valid)
-    excess = sample_kl(weights, samples.counts & jnp.any(weights > 0)) - kl_bound
+    weights = sample_weights(solution, reward, features, prior)
+    excess = sample_kl(weights, samples.prior * jnp.any(weights > 0).astype(weights.dtype)) - kl_bound
     excess = jnp.where(guess.is_active, excess, jnp.maximum(excess, 0.0))
-    uniform = jnp.where(samples.counts, 1.0 / jnp.sum(samples.counts, dtype=weights.dtype), 0.0)
-    mismatch = exact_dot(weights - uniform, samples.whitened)
+    mismatch = exact_dot(weights - samples.prior, samples.whitened)
     return solution._replace(grad_norm=jnp.sqrt(excess**2 + jnp.sum(mismatch**2)))
 
 
@@ -140,15 +142,16 @@ def sample_weights(
     solution: DualSolution,
     reward: Float[Array, " n"],
     features: Float[Array, "n m"],
-    valid: Bool[Array, " n"] | None = None,
+    prior: Prior | None = None,
 ) -> Float[Array, " n"]:
-    """Weigh the samples by exp((R - V(s)) / eta).
+    """Weigh the samples by exp((R - V(s)) / eta), times their prior.
 
     Args:
         solution: Temperature eta and baseline coefficients w, from `solve_dual` on the same samples.
         reward: Reward R of each sample.
         features: Baseline features phi of the context of each sample.
-        valid: Which samples count; all by default. One whose reward or features are not finite never does.
+        prior: Which samples count, or how much each did before its reward was seen, such as its importance
+            weight; equally by default. One whose reward or features are not finite never counts.
 
     Returns:
         Weights that sum to one, zero where a sample does not count; all zero if none does.
@@ -158,36 +161,37 @@ def sample_weights(
 
     Source: Abdolmaleki et al. 2016, the solution p(s, theta) below Eq. 12.
     """
-    valid = _is_counted(reward, features, _check_samples(reward, features, valid))
-    reward, features, counts = _mask(reward, features, valid)
-    shifted, centred = _shift(reward, counts), centre_columns(features, counts)
+    prior = _check_samples(reward, features, prior)
+    is_counted = _is_counted(reward, features, prior)
+    reward, features, prior = _mask(reward, features, prior)
+    shifted, centred = _shift(reward, prior), centre_columns(features, prior)
     advantage = (shifted - exact_dot(centred, solution.baseline_coef)) / solution.temperature
-    return jnp.where(valid, _softmax(advantage, counts), 0.0)
+    return jnp.where(is_counted, _softmax(advantage, prior), 0.0)
 
 
-def sample_kl(weights: Float[Array, " n"], valid: Bool[Array, " n"] | None = None) -> Scalar:
-    """Return the relative entropy between weights and uniform weights over the samples that count.
+def sample_kl(weights: Float[Array, " n"], prior: Prior | None = None) -> Scalar:
+    """Return the relative entropy between weights and the prior of the samples.
 
     Args:
-        weights: Weights that sum to one, zero where a sample does not count.
-        valid: Which samples count; all by default.
+        weights: Weights d that sum to one, zero where a sample does not count.
+        prior: Which samples count, or how much each did before its reward was seen; equally by default.
 
     Returns:
-        sum d log(n d), between 0 and log n.
+        sum d log(d / p) with the prior p, scaled to a sum of one; with an equal one between 0 and log n.
 
     Raises:
         ValueError: If the shapes differ.
     """
-    valid = jnp.ones(weights.shape, bool) if valid is None else valid
-    if weights.shape != valid.shape:
-        raise ValueError(f"weights and valid have to have one shape, got {weights.shape} and {valid.shape}")
-    num_samples = jnp.maximum(jnp.sum(valid, dtype=weights.dtype), 1.0)
-    # As a mean of x log x - x + 1, x = n d, whose terms are not negative: sum d log(n d) would cancel.
-    change = weights * num_samples - 1.0
+    prior = jnp.ones(weights.shape, weights.dtype) if prior is None else prior.astype(weights.dtype)
+    if weights.shape != prior.shape:
+        raise ValueError(f"weights and prior have to have one shape, got {weights.shape} and {prior.shape}")
+    prior = _normalised(prior)
+    # As a mean of x log x - x + 1, x = d / p, whose terms are not negative: sum d log(d / p) would cancel.
+    change = weights / jnp.where(prior > 0, prior, 1.0) - 1.0
     is_weighted = change > -1.0
     change = jnp.where(is_weighted, change, 0.0)
     terms = jnp.where(is_weighted, (1.0 + change) * jnp.log1p(change) - change, 1.0)
-    return jnp.sum(jnp.where(valid, terms, 0.0)) / num_samples
+    return exact_dot(prior, terms)
 
 
 class _Samples(NamedTuple):
@@ -197,7 +201,7 @@ class _Samples(NamedTuple):
     centred: Array  # features less their mean
     whitening: Array
     whitened: Array  # centred @ whitening: uncorrelated features of mean square one
-    counts: Array
+    prior: Array  # sums to one; zero where a sample does not count
 
 
 class _Guess(NamedTuple):
@@ -214,13 +218,12 @@ class _Guess(NamedTuple):
 
 def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
     """Return the solution for a small bound: a least-squares baseline, and the spread that it leaves."""
-    num_samples = jnp.sum(samples.counts, dtype=samples.reward.dtype)
-    coef = exact_dot(samples.whitening, exact_dot(samples.reward, samples.whitened)) / num_samples
+    coef = exact_dot(samples.whitening, exact_dot(samples.prior * samples.reward, samples.whitened))
     residual = samples.reward - exact_dot(samples.centred, coef)
-    residual = jnp.where(samples.counts, residual - jnp.sum(residual) / num_samples, 0.0)
+    residual = residual - exact_dot(samples.prior, residual)
     # For a small bound the relative entropy is var(R - V) / (2 eta^2).
-    temperature = jnp.sqrt(jnp.sum(residual**2) / (2.0 * num_samples * kl_bound))
-    mean_size = -jnp.sum(samples.reward) / num_samples
+    temperature = jnp.sqrt(exact_dot(samples.prior, residual**2) / (2.0 * kl_bound))
+    mean_size = -exact_dot(samples.prior, samples.reward)
     floor = _RESOLUTION * jnp.where(mean_size > 0, mean_size, 1.0)
     return _Guess(
         temperature=jnp.maximum(temperature, 2.0 * floor),
@@ -269,7 +272,7 @@ def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
     floor = _temperature_floor(guess, samples)
     unit = jnp.maximum(guess.temperature, 2.0 * floor)
     share = floor / unit
-    residual = _shift(_advantage(samples, unit, guess.baseline_coef), samples.counts)
+    residual = _shift(_advantage(samples, unit, guess.baseline_coef), samples.prior)
 
     def temperature_of(variable: Array) -> Array:
         # The floor keeps the minimum finite where no temperature above zero reaches the bound.
@@ -277,7 +280,7 @@ def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
 
     def objective(variables: Array) -> Array:
         log_temperature, coef = jnp.log(temperature_of(variables[0])), variables[1:]
-        return _dual(log_temperature, coef, residual, samples.whitened, samples.counts, kl_bound)
+        return _dual(log_temperature, coef, residual, samples.whitened, samples.prior, kl_bound)
 
     start = jnp.zeros(1 + samples.whitened.shape[1], residual.dtype)
     # In units of the temperature: weights change by factors up to e^10 times the whitened features.
@@ -290,7 +293,7 @@ def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
         floor=floor,
         num_steps=guess.num_steps + minimum.num_steps,
     )
-    improved = improved._replace(kl=sample_kl(_weigh(improved, samples), samples.counts))
+    improved = improved._replace(kl=sample_kl(_weigh(improved, samples), samples.prior))
     # Was the unit about right, then another round would be this one over again.
     is_settled = minimum.is_converged & (jnp.abs(jnp.log(change)) < 0.7) & ~_misses(improved, kl_bound)
     return improved._replace(is_settled=is_settled)
@@ -306,57 +309,65 @@ def _temperature_floor(guess: _Guess, samples: _Samples) -> Array:
 
 
 def _weigh(guess: _Guess, samples: _Samples) -> Array:
-    return _softmax(_advantage(samples, guess.temperature, guess.baseline_coef), samples.counts)
+    return _softmax(_advantage(samples, guess.temperature, guess.baseline_coef), samples.prior)
 
 
-def _standardise(reward: Array, features: Array, valid: Array) -> tuple[_Samples, Array]:
+def _standardise(reward: Array, features: Array, prior: Array) -> tuple[_Samples, Array]:
     """Return standardised samples, and the unit of their rewards."""
-    reward, features, counts = _mask(reward, features, valid)
-    shifted = _shift(reward, counts)
+    reward, features, prior = _mask(reward, features, prior)
+    shifted = _shift(reward, prior)
     spread = jnp.max(jnp.abs(shifted))
     # Equal rewards have no spread: their unit is then that of their rounding.
     rounding = jnp.finfo(reward.dtype).eps * jnp.max(jnp.abs(reward))
     unit = jnp.where(spread > 0, spread, jnp.where(rounding > 0, rounding, 1.0))
-    centred = centre_columns(features, counts)
-    matrix = whitening(centred, counts, least_spread=_LEAST_SPREAD)
-    return _Samples(shifted / unit, centred, matrix, exact_dot(centred, matrix), counts), unit
+    centred = centre_columns(features, prior)
+    matrix = whitening(centred, prior, least_spread=_LEAST_SPREAD)
+    return _Samples(shifted / unit, centred, matrix, exact_dot(centred, matrix), prior), unit
 
 
 def _advantage(samples: _Samples, temperature: Array, baseline_coef: Array) -> Array:
     return (samples.reward - exact_dot(samples.centred, baseline_coef)) / temperature
 
 
-def _softmax(advantage: Array, counts: Array) -> Array:
-    return jax.nn.softmax(jnp.where(counts, advantage, -jnp.inf))
+def _softmax(advantage: Array, prior: Array) -> Array:
+    return _normalised(prior * jnp.exp(_shift(advantage, prior)))
 
 
-def _shift(values: Array, counts: Array) -> Array:
+def _shift(values: Array, prior: Array) -> Array:
     """Subtract the largest of the values that count, which changes no weight; the others become zero."""
-    largest = jnp.max(jnp.where(counts, values, -jnp.inf))
-    return jnp.where(counts, values - largest, 0.0)
+    largest = lax.stop_gradient(jnp.max(jnp.where(prior > 0, values, -jnp.inf)))
+    return jnp.where(prior > 0, values - largest, 0.0)
 
 
-def _mask(reward: Array, features: Array, valid: Array) -> tuple[Array, Array, Array]:
-    """Put zeros where a sample does not count, and say which do; where none does, all do, as zeros.
+def _mask(reward: Array, features: Array, prior: Array) -> tuple[Array, Array, Array]:
+    """Put zeros where a sample does not count; where none does, all do equally, as zeros.
 
     It comes before any arithmetic: neither values nor gradients see what a sample that does not count holds.
+    The prior is scaled to a sum of one.
     """
-    counts = _is_counted(reward, features, valid)
+    counts = _is_counted(reward, features, prior)
+    prior = jnp.where(counts, prior, 0.0)
     reward = jnp.where(counts, reward, 0.0)
     features = jnp.where(counts[:, None], features, 0.0)
-    return reward, features, counts | ~jnp.any(counts)
+    return reward, features, _normalised(jnp.where(jnp.any(counts), prior, 1.0))
 
 
-def _is_counted(reward: Array, features: Array, valid: Array) -> Array:
-    return valid & jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
+def _normalised(weights: Array) -> Array:
+    """Scale weights, if there are any, to a sum of one; those that are too small for the format get zero."""
+    total = jnp.sum(weights)
+    weights = weights / jnp.where(total > 0, total, 1.0)
+    return jnp.where(weights >= jnp.finfo(weights.dtype).tiny, weights, 0.0)
 
 
-def _check_samples(reward: Array, features: Array, valid: Array | None) -> Array:
-    """Return the mask of valid samples, all by default, after checking shapes."""
+def _is_counted(reward: Array, features: Array, prior: Array) -> Array:
+    return (prior > 0) & jnp.isfinite(prior) & jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
+
+
+def _check_samples(reward: Array, features: Array, prior: Array | None) -> Array:
+    """Return the prior of the samples, an equal one by default, after checking shapes."""
     if reward.ndim != 1 or features.ndim != 2 or features.shape[0] != reward.shape[0] or 0 in features.shape:
         raise ValueError(f"need reward (n,) and features (n, m), got shapes {reward.shape}, {features.shape}")
-    if valid is None:
-        return jnp.ones(reward.shape, bool)
-    if valid.shape != reward.shape:
-        raise ValueError(f"valid has to have the shape of reward, {reward.shape}, got {valid.shape}")
-    return valid
+    prior = jnp.ones(reward.shape, reward.dtype) if prior is None else prior.astype(reward.dtype)
+    if prior.shape != reward.shape:
+        raise ValueError(f"prior has to have the shape of reward, {reward.shape}, got {prior.shape}")
+    return prior

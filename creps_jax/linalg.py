@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from creps_jax.typing import Array, Bool, Float, ScalarLike
+from creps_jax.typing import Array, Float, ScalarLike
 
 __all__ = [
     "centre_columns",
@@ -187,45 +187,45 @@ def safe_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     return jnp.linalg.cholesky(unit + jitter * jnp.eye(size, dtype=matrix.dtype)) * jnp.sqrt(scale)
 
 
-def centre_columns(rows: Float[Array, "n m"], counts: Bool[Array, " n"]) -> Float[Array, "n m"]:
-    """Subtract the mean of the rows that count.
+def centre_columns(rows: Float[Array, "n m"], weights: Float[Array, " n"]) -> Float[Array, "n m"]:
+    """Subtract the weighted mean of the rows.
 
     Args:
-        rows: Rows; those that do not count have to be finite.
-        counts: Which rows count, at least one.
+        rows: Rows, all of them finite.
+        weights: Weights of the rows, not negative, that sum to one; a row of weight zero does not count.
 
     Returns:
         The centred rows. Rows that do not count, and columns that are constant up to rounding, are zero.
     """
-    num_rows = jnp.sum(counts, dtype=rows.dtype)
-    centred = jnp.where(counts[:, None], rows, 0.0)
+    counts = (weights > 0)[:, None]
+    centred = jnp.where(counts, rows, 0.0)
     rounding = 4.0 * jnp.finfo(rows.dtype).eps * jnp.max(jnp.abs(centred), axis=0)
     for _ in range(2):  # the first mean is rounded in units of the offset
-        centred = jnp.where(counts[:, None], centred - (jnp.sum(centred, axis=0) / num_rows)[None, :], 0.0)
+        centred = jnp.where(counts, centred - exact_dot(weights, centred)[None, :], 0.0)
     is_constant = jnp.max(jnp.abs(centred), axis=0) <= rounding
     return jnp.where(is_constant[None, :], 0.0, centred)
 
 
 def whitening(
-    centred: Float[Array, "n m"], counts: Bool[Array, " n"], *, least_spread: ScalarLike
+    centred: Float[Array, "n m"], weights: Float[Array, " n"], *, least_spread: ScalarLike
 ) -> Float[Array, "m k"]:
     """Return the matrix W for which the columns of `centred @ W` are uncorrelated with mean square one.
 
     Args:
         centred: Rows with a mean of zero, from `centre_columns`.
-        counts: Which rows count, at least one.
+        weights: Weights of the rows in these means, not negative; they sum to one.
         least_spread: Directions with less spread than this, in columns scaled to spread one, are taken for
             rounding: their columns of W are zero.
 
     Returns:
         W; it has k = min(n, m) columns.
     """
-    root_count = jnp.sqrt(jnp.sum(counts, dtype=centred.dtype))
-    unscale = _invert_above(jnp.linalg.norm(centred, axis=0) / root_count, 0.0)
+    rows = jnp.sqrt(weights)[:, None] * centred
+    unscale = _invert_above(jnp.linalg.norm(rows, axis=0), 0.0)
     # Singular values of the columns, not eigenvalues of their products: those would square the rounding.
-    triangular = jnp.linalg.qr(centred * unscale[None, :], mode="r")
+    triangular = jnp.linalg.qr(rows * unscale[None, :], mode="r")
     _, singular_values, axes = jnp.linalg.svd(triangular, full_matrices=False)
-    return unscale[:, None] * axes.T * _invert_above(singular_values / root_count, least_spread)[None, :]
+    return unscale[:, None] * axes.T * _invert_above(singular_values, least_spread)[None, :]
 
 
 def _invert_above(values: Array, threshold: ScalarLike) -> Array:

@@ -352,7 +352,7 @@ def test_gradients_do_not_see_masked_samples():
     features = jnp.where(valid[:, None], jnp.float32(features), jnp.nan)
     solution, _ = solve(reward, features, valid, jnp.float32(0.5))
     coef = solution.baseline_coef
-    objective = partial(dual_objective, valid=valid, kl_bound=0.5)
+    objective = partial(dual_objective, prior=valid, kl_bound=0.5)
     by_all = jax.jit(jax.grad(objective, (0, 1, 2, 3)))(jnp.log(solution.temperature), coef, reward, features)
     first_weight = jax.jit(jax.grad(lambda *args: sample_weights(solution, *args, valid)[0], (0, 1)))
     by_weights = first_weight(reward, features)
@@ -405,3 +405,20 @@ def test_bad_shapes_are_named(reward, features, valid, message):
     unchecked = inspect.unwrap(solve_dual)
     with pytest.raises(ValueError, match=message):
         unchecked(jnp.zeros(reward), jnp.zeros(features), jnp.ones(valid, bool), kl_bound=0.5)
+
+
+def test_a_prior_counts_a_sample_as_often_as_copies_of_it(key):
+    """In the solution, its quality and the weights; the scale of the prior does not matter."""
+    reward_key, feature_key, count_key = jax.random.split(key, 3)
+    reward = jax.random.normal(reward_key, (NUM,))
+    features = jax.random.normal(feature_key, (NUM, 3))
+    copies = jax.random.randint(count_key, (NUM,), 0, 4)
+    index = np.repeat(np.arange(NUM), copies)
+    solution = solve_dual(reward, features, 0.01 * copies.astype(jnp.float32), kl_bound=0.5)
+    expected = solve_dual(reward[index], features[index], kl_bound=0.5)
+    np.testing.assert_allclose(solution.temperature, expected.temperature, rtol=1e-4)
+    weights = sample_weights(solution, reward, features, copies.astype(jnp.float32))
+    summed = np.bincount(index, sample_weights(expected, reward[index], features[index]), minlength=NUM)
+    np.testing.assert_allclose(weights, summed, rtol=1e-3, atol=1e-6)
+    assert solution.grad_norm < 1e-4
+    np.testing.assert_allclose(sample_kl(weights, copies.astype(jnp.float32)), 0.5, rtol=1e-3)

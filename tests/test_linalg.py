@@ -178,10 +178,10 @@ def test_safe_cholesky_adds_the_least_that_makes_an_indefinite_matrix_definite()
 def test_whitening_makes_columns_uncorrelated():
     rng = np.random.default_rng(10)
     rows = rng.normal(size=(60, 3)) @ rng.normal(size=(3, 3)) * [1e-5, 1.0, 1e5] + [0.0, 30.0, 1e6]
-    counts = jnp.arange(60) < 40
-    centred = centre_columns(jnp.float32(rows), counts)
+    weights = jnp.where(jnp.arange(60) < 40, 1 / 40, 0.0)
+    centred = centre_columns(jnp.float32(rows), weights)
     assert np.all(centred[40:] == 0)
-    white = centred @ whitening(centred, counts, least_spread=1e-4)
+    white = centred @ whitening(centred, weights, least_spread=1e-4)
     np.testing.assert_allclose(white.T @ white / 40, np.eye(3), atol=1e-3)
     np.testing.assert_allclose(white.sum(0) / 40, 0.0, atol=1e-4)
 
@@ -190,10 +190,10 @@ def test_whitening_drops_what_is_constant_or_collinear():
     rng = np.random.default_rng(11)
     column = rng.normal(size=30)
     rows = jnp.float32(np.column_stack([column, 2 * column, np.full(30, 7.1), np.zeros(30), 1e5 + column]))
-    counts = jnp.ones(30, bool)
-    centred = centre_columns(rows, counts)
+    weights = jnp.full(30, 1 / 30)
+    centred = centre_columns(rows, weights)
     assert np.all(centred[:, 2:4] == 0)
-    matrix = whitening(centred, counts, least_spread=0.1)
+    matrix = whitening(centred, weights, least_spread=0.1)
     white = centred @ matrix
     assert np.all(np.isfinite(matrix))
     assert np.sum(np.sum(np.asarray(white) ** 2, axis=0) > 1) == 1
@@ -201,9 +201,9 @@ def test_whitening_drops_what_is_constant_or_collinear():
 
 def test_whitening_of_fewer_rows_than_columns():
     rows = jnp.float32(np.random.default_rng(12).normal(size=(4, 6)))
-    counts = jnp.ones(4, bool)
-    centred = centre_columns(rows, counts)
-    white = centred @ whitening(centred, counts, least_spread=1e-4)
+    weights = jnp.full(4, 0.25)
+    centred = centre_columns(rows, weights)
+    white = centred @ whitening(centred, weights, least_spread=1e-4)
     assert white.shape == (4, 4)
     # Four points about their mean span three directions.
     np.testing.assert_allclose(np.sort(np.linalg.eigvalsh(white.T @ white / 4)), [0, 1, 1, 1], atol=1e-4)
