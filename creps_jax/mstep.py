@@ -53,7 +53,9 @@ def weighted_ml(
     return fit_weighted_ml(features, theta, weights, ridge=ridge, scale=scale, start=policy.coef)
 
 
-def bounded_ml(*, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05) -> MStep:
+def bounded_ml(
+    *, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05, entropy_loss_bound: float | None = None
+) -> MStep:
     """Make the fit by weighted maximum likelihood within bounds on how far mean and covariance may move.
 
     The relative entropy of the new policy to the old one, averaged over the contexts, is a sum of a part of
@@ -66,15 +68,19 @@ def bounded_ml(*, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05) -> MSt
     The mean that is likeliest within its bound, at the old covariance, is, in features that are uncorrelated
     over the contexts and along the eigenvectors of their weighted mean square g, a share `g / (g + l)` of
     the whole way, with a multiplier l. The whole way is that of `weighted_ml`, with its ridge. The covariance
-    that is likeliest within its bound is, along the eigenvectors of the weighted covariance s (made unbiased
-    as in Eq. 15), the root x of `l x^2 - (l - 1) x - s = 0`. No spread falls below the rounding of theta.
+    that is likeliest within its bounds is, along the eigenvectors of the weighted covariance s (made unbiased
+    as in Eq. 15), the root x of `l x^2 - (l + m - 1) x - s = 0`, where m is the multiplier of the bound on
+    the loss of entropy. No spread falls below the rounding of theta.
 
     Args:
         mean_kl_bound: Largest part of the mean in the relative entropy, nats.
         cov_kl_bound: Largest part of the covariance, nats.
+        entropy_loss_bound: Largest loss of differential entropy, nats; by default only `cov_kl_bound`
+            limits it.
 
     Returns:
-        The M-step. Where a bound is active, the policy meets it; their sum bounds the relative entropy.
+        The M-step. Where a bound is active, the policy meets it; the sum of the first two bounds the
+        relative entropy.
 
     Raises:
         ValueError: If a bound is not a positive number.
@@ -82,7 +88,10 @@ def bounded_ml(*, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05) -> MSt
     Source: The parts are bounded apart as in Abdolmaleki et al. 2018, Maximum a posteriori policy
         optimisation, Section 4.2.1; here in the other direction of the relative entropy, and exact.
     """
-    for name, bound in (("mean_kl_bound", mean_kl_bound), ("cov_kl_bound", cov_kl_bound)):
+    bounds = {"mean_kl_bound": mean_kl_bound, "cov_kl_bound": cov_kl_bound}
+    if entropy_loss_bound is not None:
+        bounds["entropy_loss_bound"] = entropy_loss_bound
+    for name, bound in bounds.items():
         if not bound > 0:
             raise ValueError(f"{name} must be positive, got {bound}")
 
@@ -95,7 +104,9 @@ def bounded_ml(*, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05) -> MSt
     ) -> LinearGaussian:
         likeliest = weighted_ml(policy, samples, ridge=ridge, scale=scale)
         coef = _bounded_mean(policy, likeliest.coef, samples, mean_kl_bound)
-        return LinearGaussian(coef, _bounded_cov_chol(policy, coef, samples, cov_kl_bound))
+        return LinearGaussian(
+            coef, _bounded_cov_chol(policy, coef, samples, cov_kl_bound, entropy_loss_bound)
+        )
 
     return m_step
 
@@ -142,9 +153,13 @@ def _uncorrelated(samples: WeightedSamples) -> tuple[Array, Array]:
 
 
 def _bounded_cov_chol(
-    policy: LinearGaussian, coef: Array, samples: WeightedSamples, kl_bound: float
+    policy: LinearGaussian,
+    coef: Array,
+    samples: WeightedSamples,
+    kl_bound: float,
+    entropy_loss_bound: float | None,
 ) -> Float[Array, "d d"]:
-    """Go from the old covariance towards the weighted one about the new mean, as far as the bound allows."""
+    """Go from the old covariance towards the weighted one about the new mean, as far as the bounds allow."""
     features, theta, weights, _ = samples
     counts = (weights > 0)[:, None]
     features, theta = (jnp.where(counts, x, 0.0) for x in (features, theta))
@@ -154,17 +169,28 @@ def _bounded_cov_chol(
     spread, axes = jnp.linalg.eigh(0.5 * (scatter + scatter.T))
     excess = jnp.maximum(spread, 0.0) - 1.0
 
-    def change(multiplier: Array) -> Array:
-        """Return x - 1, without its cancellation; at the multiplier zero it is s - 1."""
-        up = multiplier + 1.0
-        root = jnp.sqrt(jnp.maximum(up**2 + 4.0 * multiplier * excess, 0.0))
-        return 2.0 * excess / (up + root)
+    def change(kl_multiplier: Array, entropy_multiplier: Array) -> Array:
+        """Return x - 1, without its cancellation; where both multipliers are zero it is s - 1."""
+        middle = 1.0 + kl_multiplier - entropy_multiplier
+        pull = excess + entropy_multiplier
+        root = jnp.sqrt(jnp.maximum(middle**2 + 4.0 * kl_multiplier * pull, 0.0))
+        outer = jnp.abs(middle) + root
+        return jnp.where(middle > 0, 2.0 * pull / outer, outer / (2.0 * kl_multiplier))
 
-    def kl(multiplier: Array) -> Array:
-        y = change(multiplier)
-        return 0.5 * jnp.sum(y - jnp.log1p(y))
+    def change_within_kl(entropy_multiplier: Array) -> Array:
+        def kl(kl_multiplier: Array) -> Array:
+            y = change(kl_multiplier, entropy_multiplier)
+            return 0.5 * jnp.sum(y - jnp.log1p(y))
 
-    x = 1.0 + change(_least_multiplier(kl, kl_bound, policy.coef.dtype))
+        return change(_least_multiplier(kl, kl_bound, excess.dtype), entropy_multiplier)
+
+    def entropy_loss(entropy_multiplier: Array) -> Array:
+        return -0.5 * jnp.sum(jnp.log1p(change_within_kl(entropy_multiplier)))
+
+    entropy_multiplier = jnp.zeros((), excess.dtype)
+    if entropy_loss_bound is not None:
+        entropy_multiplier = _least_multiplier(entropy_loss, entropy_loss_bound, excess.dtype)
+    x = 1.0 + change_within_kl(entropy_multiplier)
     root = exact_dot(policy.cov_chol, axes * jnp.sqrt(x)[None, :])
     upper = jnp.linalg.qr(root.T, mode="r")
     cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
@@ -174,8 +200,8 @@ def _bounded_cov_chol(
     return jnp.where(jnp.any(counts), cov_chol, policy.cov_chol)
 
 
-def _least_multiplier(kl: Callable[[Array], Scalar], kl_bound: float, dtype: jnp.dtype) -> Array:
-    """Return the least multiplier at which a relative entropy, which falls with it, is within its bound."""
+def _least_multiplier(move: Callable[[Array], Scalar], bound: float, dtype: jnp.dtype) -> Array:
+    """Return the least multiplier at which what is bounded, and falls with it, is within its bound."""
     low, high = (jnp.asarray(end, dtype) for end in _LOG_MULTIPLIERS)
     shares = jnp.linspace(0.0, 1.0, _NUM_TRIALS + 1, dtype=dtype)
 
@@ -183,7 +209,7 @@ def _least_multiplier(kl: Callable[[Array], Scalar], kl_bound: float, dtype: jnp
     def refine(ends: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         low, high = ends
         trials = low + shares * (high - low)
-        fits = jax.vmap(kl)(jnp.exp(trials)) <= kl_bound
+        fits = jax.vmap(move)(jnp.exp(trials)) <= bound
         first = jnp.argmax(fits)
         first = jnp.where(jnp.any(fits), first, _NUM_TRIALS)
         return (trials[jnp.maximum(first - 1, 0)], trials[first]), None

@@ -56,10 +56,12 @@ def test_bounds_out_of_reach_change_nothing(key):
     np.testing.assert_allclose(new.cov_chol, likeliest.cov_chol, rtol=1e-3, atol=1e-4)
 
 
-def test_nothing_likelier_is_within_the_bounds(key):
-    policy, samples = make_problem(key, dim=2)
-    bounds = 0.3, 0.1
-    new = bounded_ml(mean_kl_bound=bounds[0], cov_kl_bound=bounds[1])(policy, samples, ridge=RIDGE)
+@pytest.mark.parametrize("entropy_loss", [None, 0.01, 0.001])
+def test_nothing_likelier_is_within_the_bounds(key, entropy_loss):
+    policy, samples = make_problem(key, dim=2, greed=3.0)
+    bounds = 3.0, 0.1
+    m_step = bounded_ml(mean_kl_bound=bounds[0], cov_kl_bound=bounds[1], entropy_loss_bound=entropy_loss)
+    new = m_step(policy, samples, ridge=RIDGE)
     features, theta, weights = (np.asarray(x, float) for x in samples[:3])
     inverse = np.linalg.inv(np.asarray(policy.cov_chol, float))
     start = np.ravel(policy.coef).astype(float)
@@ -88,13 +90,21 @@ def test_nothing_likelier_is_within_the_bounds(key):
         return np.linalg.slogdet(cov)[1] + np.trace(np.linalg.solve(cov, scatter))
 
     old = np.asarray(policy.cov_chol, float)
-    limit = {
-        "type": "ineq",
-        "fun": lambda flat: bounds[1] - parts(policy._replace(cov_chol=factor(flat)), policy, samples)[1],
-    }
     start = [np.log(old[0, 0]), old[1, 0], np.log(old[1, 1])]
-    best = optimize.minimize(cov_cost, start, method="SLSQP", constraints=limit).x
+
+    def cov_room(flat):
+        return bounds[1] - parts(policy._replace(cov_chol=factor(flat)), policy, samples)[1]
+
+    def entropy_room(flat):
+        return (entropy_loss or np.inf) + flat[0] + flat[2] - start[0] - start[2]
+
+    rooms = [cov_room] if entropy_loss is None else [cov_room, entropy_room]
+    limits = [{"type": "ineq", "fun": room} for room in rooms]
+    best = optimize.minimize(cov_cost, start, method="SLSQP", constraints=limits).x
     np.testing.assert_allclose(new.cov_chol, factor(best), rtol=0.01, atol=0.01)
+    if entropy_loss is not None:
+        # Without that bound more entropy is lost: it is this one that holds.
+        assert gaussian.entropy(policy) - gaussian.entropy(new) == pytest.approx(entropy_loss, rel=0.01)
 
 
 @pytest.mark.parametrize(("unit", "zero"), [(1e-4, 0.0), (1e4, 0.0), (1.0, 300.0)])
@@ -196,3 +206,8 @@ def test_a_ridge_does_not_wear_a_good_policy_down(key, m_step):
 def test_bounds_have_to_be_positive(bounds):
     with pytest.raises(ValueError, match=r"_kl_bound must be positive, got"):
         bounded_ml(mean_kl_bound=bounds[0], cov_kl_bound=bounds[1])
+
+
+def test_the_bound_on_entropy_has_to_be_positive():
+    with pytest.raises(ValueError, match=r"entropy_loss_bound must be positive, got -1.0"):
+        bounded_ml(entropy_loss_bound=-1.0)
