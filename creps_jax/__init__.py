@@ -9,6 +9,7 @@ from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
 from creps_jax.creps import Creps, CrepsInfo, CrepsState, creps
 from creps_jax.dual import DualSolution, sample_weights, solve_dual
 from creps_jax.features import FeatureMap, linear_features, quadratic_features, rbf_features
+from creps_jax.importance import Importance
 from creps_jax.linalg import thomas_solve
 from creps_jax.motion.nao_kinematics import leg_fk, leg_ik
 from creps_jax.motion.walking.com import com_trajectory
@@ -37,6 +38,7 @@ __all__ = [
     "CrepsState",
     "DualSolution",
     "FeatureMap",
+    "Importance",
     "IterationLog",
     "LinearGaussian",
     "Outcome",

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from creps_jax.typing import Array, Bool, Float, IntScalar
+from creps_jax.typing import Array, Bool, Float, Int, IntScalar
 
 __all__ = ["Archive", "Batch", "empty_archive", "push", "valid"]
 
@@ -25,11 +25,13 @@ class Archive(NamedTuple):
         batch: The slots, in no particular order of age; slots never written hold zeros.
         next_index: The slot that the next sample goes to.
         size: How many slots have been written, at most L.
+        age: How many batches were pushed after that of each slot.
     """
 
     batch: Batch
     next_index: IntScalar
     size: IntScalar
+    age: Int[Array, " L"]
 
 
 def empty_archive(archive_size: int, context_dim: int, theta_dim: int) -> Archive:
@@ -45,7 +47,8 @@ def empty_archive(archive_size: int, context_dim: int, theta_dim: int) -> Archiv
         theta=jnp.zeros((archive_size, theta_dim), jnp.float32),
         reward=jnp.zeros(archive_size, jnp.float32),
     )
-    return Archive(batch, next_index=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
+    zero = jnp.zeros((), jnp.int32)
+    return Archive(batch, next_index=zero, size=zero, age=jnp.zeros(archive_size, jnp.int32))
 
 
 def push(archive: Archive, batch: Batch) -> Archive:
@@ -61,6 +64,7 @@ def push(archive: Archive, batch: Batch) -> Archive:
         batch=jax.tree.map(lambda old, new: old.at[slots].set(new[first_kept:]), archive.batch, batch),
         next_index=(archive.next_index + num_new) % archive_size,
         size=jnp.minimum(archive.size + num_new, archive_size),
+        age=(archive.age + 1).at[slots].set(0),
     )
 
 

@@ -17,6 +17,7 @@ from creps_jax import policy as gaussian
 from creps_jax.archive import Archive, Batch, empty_archive, push, valid
 from creps_jax.dual import DualSolution, sample_kl, sample_weights, solve_dual
 from creps_jax.features import FeatureMap
+from creps_jax.importance import Importance, PolicyHistory, empty_history, importance_weights, remember
 from creps_jax.linalg import exact_dot
 from creps_jax.mstep import MStep, WeightedSamples, weighted_ml
 from creps_jax.policy import LinearGaussian
@@ -32,6 +33,8 @@ class CrepsState(NamedTuple):
     archive: Archive
     iteration: IntScalar
     """How many batches have been told."""
+    history: PolicyHistory | None = None
+    """The policies that archived samples were drawn from; None where all samples count equally."""
 
 
 class CrepsInfo(NamedTuple):
@@ -39,12 +42,16 @@ class CrepsInfo(NamedTuple):
 
     dual: DualSolution
     kl: Scalar
-    """Relative entropy between the weights and uniform weights, in nats; the KL bound limits it."""
+    """Relative entropy between the weights and those before rewards are looked at, in nats; the KL bound
+    limits it."""
     policy_kl: Scalar
     """KL(new policy || old policy) in nats, the mean over the archived contexts. The bound is on
     the weighted samples: with few of them the fitted Gaussian moves farther, with many old ones less."""
     effective_samples: Scalar
     """1 / sum of squared weights: how many equally weighted samples carry as much information."""
+    prior_effective_samples: Scalar
+    """The same of the weights that samples have before rewards are looked at: the number of valid ones,
+    or what their importance weights leave of it."""
     entropy: Scalar
     """Differential entropy of the new policy, in nats."""
     num_valid: IntScalar
@@ -83,6 +90,7 @@ def creps(
     archive_size: int,
     ridge: float | int = 1e-4,
     m_step: MStep = weighted_ml,
+    importance: Importance | None = None,
 ) -> Creps:
     """Set up contextual relative entropy policy search.
 
@@ -94,6 +102,9 @@ def creps(
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale.
         m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's, goes wherever
             they lead; `bounded_ml()` keeps mean and covariance from moving too far at once.
+        importance: Weigh archived samples by how likely they are today over how likely they were when drawn
+            (`Importance()`); by default all count equally, as in the paper. The weights are those of samples
+            that were drawn by `ask`.
 
     Returns:
         The functions `init`, `ask`, `tell` and `mean`. These raise ValueError, showing what they
@@ -112,7 +123,8 @@ def creps(
         theta_dim = _checked_theta_dim(policy, policy_features)
         archive = empty_archive(archive_size, context_dim, theta_dim)
         policy = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), policy)
-        return CrepsState(policy, archive, iteration=jnp.zeros((), jnp.int32))
+        history = None if importance is None else empty_history(policy, importance.num_policies)
+        return CrepsState(policy, archive, jnp.zeros((), jnp.int32), history)
 
     def ask(key: PRNGKey, state: CrepsState, contexts: ArrayLike) -> Float[Array, "n d"]:
         contexts = _checked("contexts", contexts, ("n", context_dim))
@@ -126,10 +138,25 @@ def creps(
         # What is left out must not enter: 0 * nan is not 0.
         samples = jax.tree.map(lambda x: jnp.where(_along(is_valid, x), x, 0.0), archive.batch)
 
-        baseline = jax.vmap(baseline_features.apply)(samples.context)
-        dual = solve_dual(samples.reward, baseline, is_valid, kl_bound=kl_bound)  # Eq. (13)
-        weights = sample_weights(dual, samples.reward, baseline, is_valid)
         features = jax.vmap(policy_features.apply)(samples.context)
+        prior, history = is_valid.astype(jnp.float32), _checked_history(state, importance)
+        if importance is not None and history is not None:
+            history = remember(history, state.policy, state.iteration)
+            prior = importance_weights(
+                state.policy,
+                history,
+                features,
+                samples.theta,
+                archive.age,
+                is_valid,
+                state.iteration,
+                least_effective=importance.least_effective,
+            )
+            is_valid = prior > 0
+
+        baseline = jax.vmap(baseline_features.apply)(samples.context)
+        dual = solve_dual(samples.reward, baseline, prior, kl_bound=kl_bound)  # Eq. (13)
+        weights = sample_weights(dual, samples.reward, baseline, prior)
         weighted = WeightedSamples(features, samples.theta, weights, is_valid)
         fitted = m_step(state.policy, weighted, ridge=ridge, scale=scale)  # Eq. (14), (15)
 
@@ -141,14 +168,15 @@ def creps(
 
         info = CrepsInfo(
             dual=dual,
-            kl=sample_kl(weights, is_valid),
+            kl=sample_kl(weights, prior),
             policy_kl=_mean_kl(policy, state.policy, features, is_valid),
             effective_samples=_effective_samples(weights),
+            prior_effective_samples=_effective_samples(prior),
             entropy=gaussian.entropy(policy),
             num_valid=num_valid,
             is_updated=is_updated,
         )
-        return CrepsState(policy, archive, state.iteration + 1), info
+        return CrepsState(policy, archive, state.iteration + 1, history), info
 
     def mean(policy: LinearGaussian, contexts: ArrayLike) -> Float[Array, "n d"]:
         contexts = _checked("contexts", contexts, ("n", context_dim))
@@ -171,7 +199,7 @@ def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array,
 
 def _effective_samples(weights: Array) -> Scalar:
     squares = jnp.sum(weights**2)
-    return jnp.where(squares > 0, 1.0 / jnp.where(squares > 0, squares, 1.0), 0.0)
+    return jnp.sum(weights) ** 2 / jnp.where(squares > 0, squares, 1.0)
 
 
 def _along(mask: Array, array: Array) -> Array:
@@ -198,6 +226,14 @@ def _checked_batch(batch: Batch, archive: Archive) -> Batch:
     context = _checked("batch.context", batch.context, (num, context_dim))
     theta = _checked("batch.theta", batch.theta, (num, archive.batch.theta.shape[1]))
     return Batch(context, theta, reward)
+
+
+def _checked_history(state: CrepsState, importance: Importance | None) -> PolicyHistory | None:
+    expected = 0 if importance is None else importance.num_policies
+    got = 0 if state.history is None else state.history.coef.shape[0]
+    if got != expected:
+        raise ValueError(f"the state must hold the last {expected} policies, as `init` makes it, got {got}")
+    return state.history
 
 
 def _checked_theta_dim(policy: LinearGaussian, policy_features: FeatureMap) -> int:
