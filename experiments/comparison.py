@@ -11,6 +11,7 @@ from scipy import stats
 
 from creps_jax.creps import Creps, creps
 from creps_jax.features import FeatureMap
+from creps_jax.importance import Importance
 from creps_jax.policy import LinearGaussian
 from creps_jax.tasks.base import Task
 from creps_jax.train import evaluate
@@ -49,6 +50,8 @@ class LearnerSettings:
             paper's unbounded fit.
         cov_kl_bound: how far it may move the covariance, nats.
         start_std: standard deviation of the first policy, whose mean is zero.
+        importance_policies: number of last policies whose samples are weighed by importance, see
+            `creps_jax.Importance`; None is the paper's archive, all of whose samples count equally.
     """
 
     iterations: int = 1000
@@ -60,6 +63,7 @@ class LearnerSettings:
     mean_kl_bound: float | None = None
     cov_kl_bound: float | None = None
     start_std: float = 1.0
+    importance_policies: int | None = None
 
 
 def make_contender(
@@ -72,6 +76,7 @@ def make_contender(
         archive_size=settings.archive_size,
         ridge=settings.ridge,
         m_step=make_m_step(settings.mean_kl_bound, settings.cov_kl_bound),
+        importance=None if settings.importance_policies is None else Importance(settings.importance_policies),
     )
     dim = task.theta_dim
     start = LinearGaussian(jnp.zeros((features[0].size, dim)), settings.start_std * jnp.eye(dim))

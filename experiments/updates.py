@@ -1,7 +1,9 @@
 """Hold the bounded fit of the policy against the paper's, on test functions and all tasks but walking.
 
 Each has the archive that it does best with: without bounds a long one, which slows the policy down as bounds
-do; with bounds a short one, as older samples say less. The functions also show the paper's fit without one.
+do; with bounds a short one, as older samples say less. Others tell what the archive does from what the bounds
+do: the paper's fit with the short one, and the bounded one with twice as long a one whose samples are weighed
+by importance. The functions also show the paper's fit without an archive.
 """
 
 import dataclasses
@@ -26,7 +28,13 @@ from experiments.learning import Session
 from experiments.registry import Claim
 from experiments.tables import to_markdown
 
-LABELS = {"plain": "weighted ML, no archive", "archive": "weighted ML", "bounded": "bounded"}
+LABELS = {
+    "plain": "weighted ML, no archive",
+    "archive": "weighted ML",
+    "short": "weighted ML, short archive",
+    "bounded": "bounded",
+    "importance": "bounded, importance weights",
+}
 FUNCTIONS = {
     "sphere": sphere,
     "ellipsoid": ellipsoid,
@@ -82,16 +90,12 @@ def _function_bench(function: Callable[[jax.Array], jax.Array], key: jax.Array) 
     task = contextual_function(function, jax.random.normal(transform_key, (THETA_DIM, CONTEXT_DIM)))
     features = linear_features(CONTEXT_DIM)
     coef = jnp.zeros((features.size, THETA_DIM)).at[0].set(jax.random.normal(start_key, (THETA_DIM,)))
+    plain = LearnerSettings(archive_size=50, kl_bound=1.0, ridge=1e-10)
+    mean_kl_bound, cov_kl_bound = FUNCTION_KL_BOUNDS
     learners = {
-        "plain": LearnerSettings(archive_size=50, kl_bound=1.0, ridge=1e-10),
-        "archive": LearnerSettings(archive_size=1000, kl_bound=1.0, ridge=1e-10),
-        "bounded": LearnerSettings(
-            archive_size=200,
-            kl_bound=1.0,
-            ridge=1e-10,
-            mean_kl_bound=FUNCTION_KL_BOUNDS[0],
-            cov_kl_bound=FUNCTION_KL_BOUNDS[1],
-        ),
+        "plain": plain,
+        "archive": dataclasses.replace(plain, archive_size=1000),
+        **_with_bounds(plain, 200, mean_kl_bound, cov_kl_bound),
     }
     contenders = {}
     for fit, learner in learners.items():
@@ -100,15 +104,24 @@ def _function_bench(function: Callable[[jax.Array], jax.Array], key: jax.Array) 
     return Bench(contenders, context_grid((1.0, 1.0), (2.0, 2.0), 5))
 
 
+def _with_bounds(
+    learner: LearnerSettings, archive_size: int, mean_kl_bound: float, cov_kl_bound: float
+) -> dict[str, LearnerSettings]:
+    """Return a learner with a shorter archive, the same within bounds, and that with importance weights."""
+    short = dataclasses.replace(learner, archive_size=archive_size)
+    bounded = dataclasses.replace(short, mean_kl_bound=mean_kl_bound, cov_kl_bound=cov_kl_bound)
+    long = 2 * archive_size
+    # As many policies as have samples in the archive.
+    policies = -(-long // Settings.samples)
+    importance = dataclasses.replace(bounded, archive_size=long, importance_policies=policies)
+    return {"short": short, "bounded": bounded, "importance": importance}
+
+
 def _task_bench(
     task: Task, features: FeatureMap, grid: jax.Array, *, start_std: float, cov_kl_bound: float
 ) -> Bench:
-    learners = {
-        "archive": LearnerSettings(start_std=start_std),
-        "bounded": LearnerSettings(
-            archive_size=400, mean_kl_bound=0.3, cov_kl_bound=cov_kl_bound, start_std=start_std
-        ),
-    }
+    paper = LearnerSettings(start_std=start_std)
+    learners = {"archive": paper, **_with_bounds(paper, 400, 0.3, cov_kl_bound)}
     pair = (features, features)
     return Bench({fit: make_contender(task, pair, learner) for fit, learner in learners.items()}, grid)
 
