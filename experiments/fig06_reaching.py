@@ -26,7 +26,12 @@ from experiments.registry import Claim
 
 LOW, HIGH = (-1.5, -1.5), (-0.5, -0.5)
 SHOWN = ((-1.25, -0.75), (-0.75, -1.25))
-LABELS = {"linear": "linear", "rbf": "RBFs", "uniform": "linear, uniform contexts"}
+LABELS = {
+    "linear": "linear",
+    "rbf": "RBFs",
+    "quadratic": "quadratic",
+    "uniform": "linear, uniform contexts",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,12 +49,16 @@ SETTINGS = {"paper": Settings(), "quick": Settings(iterations=200, trials=5)}
 
 
 def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
-    """Learn with linear and RBF features, and with uniform contexts.
+    """Learn with linear and RBF features, with quadratic ones, and with uniform contexts.
+
+    The paper has no quadratic policies. They can do all that linear ones can: where they are worse, it is
+    not what features can express that matters, but how many coefficients there are to learn.
 
     Returns:
-        The arrays of `compare`, with the contenders linear, rbf and uniform.
+        The arrays of `compare`, with the contenders linear, rbf, quadratic and uniform.
     """
-    linear = (linear_features(2), quadratic_features(2))
+    quadratic = quadratic_features(2)
+    linear = (linear_features(2), quadratic)
     rbf = rbf_features(LOW, HIGH, settings.num_centers)
     gaussian, uniform = gaussian_contexts(LOW, HIGH, clip=True), uniform_contexts(LOW, HIGH)
     contenders = {
@@ -57,6 +66,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         for name, features, sampler in (
             ("linear", linear, gaussian),
             ("rbf", (rbf, rbf), gaussian),
+            ("quadratic", (quadratic, quadratic), gaussian),
             ("uniform", linear, uniform),
         )
     }
@@ -75,8 +85,8 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
 def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     """Draw Fig. 6a and 6b, the last regrets, and the arm's postures (Fig. 7)."""
     panels = {
-        "Linear and RBF policies": ("linear", "rbf"),
-        "Gaussian and uniform contexts": ("linear", "uniform"),
+        "Policies": ("linear", "rbf", "quadratic"),
+        "Contexts": ("linear", "uniform"),
     }
     figure, axes = plots.new_figure(2, len(SHOWN), width=8.0, height=7.4)
     for row, name in enumerate(("linear", "rbf")):

@@ -10,7 +10,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 COLOURS = ("#0b6e99", "#d1495b", "#edae49", "#3d7a4f", "#7a5195", "#2f9e8f")
 PAPER_COLOUR = "#8a8a8a"
@@ -148,11 +148,18 @@ def learning_curves(
         for label, value in (references or {}).items():
             axes.axhline(value, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label=label)
         _over_episodes(axes, title)
-        axes.legend(loc="lower right", fontsize=10 if columns < 3 else 7)
+        if rows == 1:
+            axes.legend(loc="lower right", fontsize=10 if columns < 3 else 7)
         if not share:
             reward_scale(axes, [rewards for _, rewards in curves.values()])
     for axes in grid[:, 0]:
         axes.set_ylabel("mean reward")
+    if rows > 1:  # one for all: in each of many small panels it would hide the curves
+        drawn = [axes.get_legend_handles_labels() for axes in grid.flat]
+        handles = {
+            label: handle for lines, names in drawn for handle, label in zip(lines, names, strict=True)
+        }
+        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
     if share:
         curves = [rewards for curves in panels.values() for _, rewards in curves.values()]
         reward_scale(grid[0, 0], curves)
@@ -356,6 +363,7 @@ def plot_ground(axes: Axes, center: float, width: float, depth: float) -> None:
 
 def _over_episodes(axes: Axes, title: str) -> None:
     axes.set(xlabel="episodes", title=title)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
 
 
