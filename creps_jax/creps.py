@@ -11,6 +11,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from creps_jax import policy as gaussian
@@ -108,7 +110,8 @@ def creps(
 
     Returns:
         The functions `init`, `ask`, `tell` and `mean`. These raise ValueError, showing what they
-        got and what they expected, if shapes do not fit the features or the policy.
+        got and what they expected, if shapes do not fit the features or the policy, or if contexts to ask
+        for are not finite.
 
     Raises:
         ValueError: If a setting is out of its range, or the features are of different contexts.
@@ -184,7 +187,13 @@ def creps(
         return jax.vmap(gaussian.mean, (None, 0))(policy, features)
 
     # Compiled here, as ask and tell are called by hand where a robot is real.
-    return Creps(init, jax.jit(ask), jax.jit(tell), jax.jit(mean))
+    compiled_ask, compiled_mean = jax.jit(ask), jax.jit(mean)
+    return Creps(
+        init=init,
+        ask=lambda key, state, contexts: compiled_ask(key, state, _checked_finite(contexts)),
+        tell=jax.jit(tell),
+        mean=lambda policy, contexts: compiled_mean(policy, _checked_finite(contexts)),
+    )
 
 
 def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array, is_valid: Array) -> Scalar:
@@ -218,6 +227,15 @@ def _checked(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Array
         expected = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
         raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
     return array
+
+
+def _checked_finite(contexts: ArrayLike) -> ArrayLike:
+    """Refuse contexts that are not finite; within a trace nobody can tell."""
+    if not isinstance(contexts, Tracer):
+        values = np.asarray(contexts, float)
+        if not np.isfinite(values).all():
+            raise ValueError(f"contexts must be finite, got {values[~np.isfinite(values)][0]}")
+    return contexts
 
 
 def _checked_batch(batch: Batch, archive: Archive) -> Batch:

@@ -198,6 +198,15 @@ def test_refuses_contexts_of_the_wrong_shape(key, state, shape):
         assert str(shape) in str(error.value)
 
 
+def test_refuses_contexts_that_are_not_finite(key, state):
+    for call in (lambda c: ALGORITHM.ask(key, state, c), lambda c: ALGORITHM.mean(state.policy, c)):
+        with pytest.raises(ValueError, match="contexts must be finite, got nan"):
+            call(np.array([[0.5], [np.nan]]))
+        np.testing.assert_array_equal(
+            jax.jit(call)(jnp.full((1, 1), jnp.nan)), np.full((1, THETA_DIM), np.nan)
+        )
+
+
 @pytest.mark.parametrize(
     ("shapes", "message"),
     [
