@@ -14,6 +14,7 @@ DESCRIPTIONS = {
     "fig05_sinus": "learn the sine of the context, with linear and with RBF features (Fig. 5)",
     "fig06_reaching": "reach via-points with a planar arm (Fig. 6 and 7)",
     "fig08_hole": "reach into a hole with a planar arm (Fig. 8 and 9)",
+    "fig11_walk": "ways to learn to walk: features, constraints, fits (Fig. 10, 11a and Table 2)",
     "updates": "the paper's fit of the policy against the bounded one, on all tasks but walking",
 }
 """What each experiment shows; its module has the same name."""

@@ -11,24 +11,27 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
+from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
-from creps_jax.creps import Creps, creps
+from creps_jax.creps import Creps, CrepsState, creps
 from creps_jax.features import quadratic_features
 from creps_jax.motion.walking.params import NAO_BOUNDS, PAPER_BOUNDS, PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.policy import LinearGaussian
-from creps_jax.tasks import Task, average_repeats, sigmoid_constrained
+from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constrained
 from creps_jax.tasks.nao_walk import WalkNoise, nao_walk
 from creps_jax.train import evaluate
 from experiments import plots, results, tables
 from experiments.errors import UserError
-from experiments.learning import Plan, Session, learn, make_m_step, trial_keys
+from experiments.learning import Log, Plan, Session, learn, make_m_step, trial_keys
 from experiments.policy_file import Features, SavedPolicy, save_policy
 from experiments.registry import Claim
 from experiments.walking_policy import POLICY, START_UP, record, save_film
 
 BOUNDS = {"nao": NAO_BOUNDS, "paper": PAPER_BOUNDS}
 SAMPLERS = {"gaussian": partial(gaussian_contexts, clip=True), "uniform": uniform_contexts}
+CONSTRAINTS = ("sigmoid", "penalty")
+PENALTY = 1000.0
 FILMED_SPEEDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 TIMESTEP = 0.004
 
@@ -50,8 +53,10 @@ class Settings:
         cov_kl_bound: how far it may move the covariance, nats.
         features: kind, number and width of the policy's features.
         bounds: which box the parameters are kept in, a name in BOUNDS.
+        constraint: how they are, a name in CONSTRAINTS: squashed by a sigmoid, or by a penalty of the reward.
         start_mean: mean of the first policy before squashing; 0 is the middle of the box.
-        start_std: its standard deviation before squashing.
+        start_std: its standard deviation before squashing. With a penalty the first policy is, to first
+            order, the same.
         low: lowest speed, m/s.
         high: highest speed, m/s.
         duration: length of an episode of the evaluation, s.
@@ -78,6 +83,7 @@ class Settings:
     cov_kl_bound: float | None = None
     features: Features = Features("rbf", 5)
     bounds: str = "nao"
+    constraint: str = "sigmoid"
     start_mean: float = 0.0
     start_std: float = 1.0
     low: float = 0.1
@@ -95,7 +101,7 @@ class Settings:
         # Settings that come back from a manifest are plain.
         if isinstance(self.features, Mapping):
             object.__setattr__(self, "features", Features(**self.features))
-        for name, known in (("bounds", BOUNDS), ("sampler", SAMPLERS)):
+        for name, known in (("bounds", BOUNDS), ("constraint", CONSTRAINTS), ("sampler", SAMPLERS)):
             if getattr(self, name) not in known:
                 raise UserError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 
@@ -136,37 +142,18 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         Arrays of the learning (trials, iterations), the policies, their parameters over the speeds
         (trials, n, d) and the evaluation (trials, n, seeds).
     """
-    algorithm = make_algorithm(settings)
-    plan = Plan(
-        settings.iterations,
-        settings.samples,
-        settings.first_samples,
-        repeats=settings.repeats,
-        timestep=TIMESTEP,
-    )
+    if settings.constraint != "sigmoid":
+        raise UserError(f"a policy is only kept with the constraint sigmoid, got {settings.constraint!r}")
     evaluate_key, learn_key = jax.random.split(key)
-    states, log = learn(
-        trial_keys(learn_key, settings.trials),
-        average_repeats(
-            make_task(settings, noise=settings.learning_noise, duration=settings.learning_duration),
-            settings.repeats,
-        ),
-        algorithm,
-        first_policy(settings),
-        plan,
-        session=session,
-        name="walk",
-    )
+    states, log = learn_to_walk(settings, learn_key, session=session, name="walk")
     policy = states.policy
-    speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
-    free = np.asarray(jax.vmap(algorithm.mean, (0, None))(policy, speeds[:, None]))
-    outcome = evaluate_trials(evaluate_key, make_task(settings), speeds, free, repeats=settings.eval_seeds)
+    speeds, outcome = walk_at_all_speeds(settings, evaluate_key, policy)
     fine = np.linspace(settings.low, settings.high, 51, dtype=np.float32)
     policies = [
         saved_policy(settings, LinearGaussian(*pair)) for pair in zip(*map(np.asarray, policy), strict=True)
     ]
     return {
-        "episodes": plan.episodes(np.arange(1, log["mean_reward"].shape[1] + 1)),
+        "episodes": make_plan(settings).episodes(np.arange(1, log["mean_reward"].shape[1] + 1)),
         "coef": np.asarray(policy.coef),
         "cov_chol": np.asarray(policy.cov_chol),
         "fine_speeds": fine,
@@ -180,8 +167,46 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     }
 
 
+def make_plan(settings: Settings) -> Plan:
+    """Return how long to learn, and with how many samples."""
+    return Plan(
+        settings.iterations,
+        settings.samples,
+        settings.first_samples,
+        repeats=settings.repeats,
+        timestep=TIMESTEP,
+    )
+
+
+def learn_to_walk(
+    settings: Settings, key: jax.Array, *, session: Session, name: str
+) -> tuple[CrepsState, Log]:
+    """Learn in all trials; see `experiments.learning.learn`, whose log this is."""
+    task = make_task(settings, noise=settings.learning_noise, duration=settings.learning_duration)
+    return learn(
+        trial_keys(key, settings.trials),
+        average_repeats(task, settings.repeats),
+        make_algorithm(settings),
+        first_policy(settings),
+        make_plan(settings),
+        session=session,
+        name=name,
+    )
+
+
+def walk_at_all_speeds(settings: Settings, key: jax.Array, policy: LinearGaussian) -> tuple[np.ndarray, Any]:
+    """Roll out the mean policies (trials, ...) at the paper's speeds, with fresh seeds.
+
+    Returns:
+        The speeds (n,), m/s, and the outcome (trials, n, seeds).
+    """
+    speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
+    thetas = np.asarray(jax.vmap(make_algorithm(settings).mean, (0, None))(policy, speeds[:, None]))
+    return speeds, evaluate_trials(key, make_task(settings), speeds, thetas, repeats=settings.eval_seeds)
+
+
 def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None = None) -> Task:
-    """Make the walking task, with parameters that are squashed into their bounds.
+    """Make the walking task, with parameters that are kept in their bounds.
 
     Args:
         settings: settings of the experiment.
@@ -199,6 +224,8 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
         noise=WalkNoise().times(noise),
         balance=settings.balance(),
     )
+    if settings.constraint == "penalty":
+        return penalised(task, *BOUNDS[settings.bounds], PENALTY)
     return sigmoid_constrained(task, *BOUNDS[settings.bounds])
 
 
@@ -218,10 +245,18 @@ def make_algorithm(settings: Settings) -> Creps:
 def first_policy(settings: Settings) -> LinearGaussian:
     """Return the policy to begin with: the same for every speed."""
     num_features = settings.features.make(settings.low, settings.high).size
-    coef = jnp.full((num_features, len(PARAM_NAMES)), settings.start_mean)
+    mean, std = (
+        jnp.full(len(PARAM_NAMES), settings.start_mean),
+        jnp.full(len(PARAM_NAMES), settings.start_std),
+    )
+    if settings.constraint == "penalty":
+        low, high = (jnp.asarray(bound) for bound in BOUNDS[settings.bounds])
+        mean, slope = jax.jvp(lambda free: sigmoid_gate(free, low, high), (mean,), (jnp.ones_like(mean),))
+        std = slope * std
+    coef = jnp.tile(mean, (num_features, 1))
     if settings.features.kind == "linear":
         coef = coef.at[1:].set(0.0)
-    return LinearGaussian(coef, settings.start_std * jnp.eye(len(PARAM_NAMES)))
+    return LinearGaussian(coef, jnp.diag(std))
 
 
 def evaluate_trials(

@@ -9,14 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.constraints import sigmoid_gate
-from creps_jax.contexts import gaussian_contexts
 from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.nao_walk import WalkOutcome, nao_walk
 from creps_jax.train import evaluate
-from experiments import results, runner, walk, walking_policy
+from experiments import fig11_walk, results, runner, walk, walking_policy
 from experiments.cli import main
 from experiments.errors import UserError
 from experiments.policy_file import load_policy, policies_folder
@@ -24,18 +22,16 @@ from experiments.video import Clip, VideoError
 from experiments.walking_policy import balance_of, load_walking_policy
 
 
-def stand_in(settings, **_) -> Task:
+def stand_in(low, high, *, sample_context, duration, **_) -> Task:
     """Return a task in which the step length over the step duration is the speed."""
+    del low, high
 
     def rollout(key, context, theta):
-        low, high = (jnp.array(bound) for bound in walk.BOUNDS[settings.bounds])
-        theta = sigmoid_gate(theta, low, high)
         speed = jnp.stack([theta[7] / theta[3], jnp.zeros_like(theta[0])])
         fell = speed[0] > 0.9
         reward = -10.0 * (speed[0] - context[0]) ** 2 - 100.0 * fell.astype(jnp.float32)
-        return WalkOutcome(reward, jnp.zeros(0), fell, speed, jnp.float32(settings.duration))
+        return WalkOutcome(reward, jnp.zeros(0), fell, speed, jnp.float32(duration))
 
-    sample_context = gaussian_contexts(settings.low, settings.high, clip=True)
     return Task(sample_context, rollout, context_dim=1, theta_dim=len(PARAM_NAMES), worst_reward=-200.0)
 
 
@@ -45,7 +41,7 @@ def bench(tmp_path, monkeypatch):
     filmed = []
     clips = [Clip("asked 0.30 m/s, reached 0.30 m/s", np.zeros((5, 29)), 0.02)]
     settings = walk.Settings(iterations=2, trials=2, eval_seeds=3, first_samples=30, samples=30)
-    monkeypatch.setattr(walk, "make_task", stand_in)
+    monkeypatch.setattr(walk, "nao_walk", stand_in)
     for module in (walk, walking_policy):
         monkeypatch.setattr(module, "record", lambda policy, speeds, **_: (policy.theta(speeds[0]), clips)[1])
     monkeypatch.setattr(walking_policy, "write_video", lambda path, *_, **__: filmed.append(path))
@@ -79,6 +75,40 @@ def test_the_result_folder_is_complete(bench):
     walking_policy.show(0.3, None, out=None, seed=0, say=said.append)
     assert said[0] == f"policy: {folder / 'policy.npz'}"
     assert said[-1] == "video: results/walk/walk-0.30.mp4"
+
+
+def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
+    settings = dataclasses.replace(walk.SETTINGS["quick"], mean_kl_bound=0.5, cov_kl_bound=0.05)
+    key = jax.random.key(0)
+    arrays = fig11_walk.run(settings, key)
+    for name in fig11_walk.CONTENDERS:
+        assert arrays[f"{name}.sample_reward"].shape == (2, 2)
+        assert arrays[f"{name}.reward"].shape == (2, 11, 3)
+    # The same samples but for how they are kept within bounds and what features round.
+    first = {name: arrays[f"{name}.sample_reward"][:, 0] for name in fig11_walk.CONTENDERS}
+    np.testing.assert_allclose(first["rbf"], first["unbounded"])
+    np.testing.assert_allclose(first["rbf"], first["linear"], rtol=1e-3)
+    assert (first["penalty"] < first["linear"] - 100).all()
+    assert set(fig11_walk.plot(arrays)) == {"learning_curve", "final"}
+    said = []
+    fig11_walk.finish(settings, arrays, tmp_path, said.append)
+    assert (tmp_path / "table.md").read_text() == said[0]
+    assert len(said[0].splitlines()) == 2 + 11 and "-3338.082" in said[0]
+    for claim in fig11_walk.CLAIMS:
+        assert claim.measure(arrays) >= 0
+    lack = 1.0 / np.arange(1.0, 6.0)[:, None, None]
+    assert fig11_walk.p_value({"a.reward": -lack, "b.reward": -2 * lack}, "a", "b") == pytest.approx(2.0**-5)
+
+
+def test_a_penalised_search_starts_where_a_squashed_one_does():
+    settings = dataclasses.replace(walk.SETTINGS["quick"], constraint="penalty")
+    low, high = (np.array(bound) for bound in walk.BOUNDS["nao"])
+    start = walk.first_policy(settings)
+    np.testing.assert_allclose(start.coef[0], low + (high - low) / (1 + np.exp(0.3)), rtol=1e-5, atol=1e-6)
+    # The slope of the sigmoid there, 0.244, times the standard deviation of one before it.
+    np.testing.assert_allclose(jnp.diagonal(start.cov_chol), 0.2445 * (high - low), rtol=1e-3)
+    with pytest.raises(UserError, match="only kept with the constraint sigmoid, got 'penalty'"):
+        walk.run(settings, jax.random.key(0))
 
 
 def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):

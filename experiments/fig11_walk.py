@@ -1,0 +1,150 @@
+"""Compare ways to learn to walk (Abdolmaleki et al. 2016, 4.3, Fig. 10, 11a and Table 2)."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+from scipy import stats
+
+from experiments import plots, results, walk
+from experiments.learning import Session
+from experiments.policy_file import Features
+from experiments.registry import Claim
+from experiments.tables import PAPER_LINEAR, PAPER_RBF, to_markdown
+
+CONTENDERS: dict[str, dict[str, Any]] = {
+    "rbf": {},
+    "linear": {"features": Features("linear")},
+    "penalty": {"features": Features("linear"), "constraint": "penalty"},
+    "unbounded": {"mean_kl_bound": None, "cov_kl_bound": None},
+}
+"""What each changes of the settings; the paper compares constraints with linear policies."""
+
+LABELS = {"rbf": "RBFs", "linear": "linear", "penalty": "linear, penalty", "unbounded": "RBFs, weighted ML"}
+PANELS = {
+    "Constraints (Fig. 10)": ("linear", "penalty"),
+    "Features (Fig. 11a)": ("linear", "rbf"),
+    "Fits": ("unbounded", "rbf"),
+}
+_SMOOTHED = 5
+"""Iterations whose mean reward tells how far learning is: one fall in 45 samples is -2."""
+
+Settings = walk.Settings
+SETTINGS = {
+    "quick": dataclasses.replace(walk.SETTINGS["quick"], trials=5),
+    "paper": walk.SETTINGS["paper"],
+    "best": dataclasses.replace(walk.SETTINGS["best"], trials=5),
+}
+
+
+def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
+    """Let all contenders learn from the same keys, and walk at the paper's speeds with fresh seeds.
+
+    Returns:
+        `speeds` (n,), `episodes` (iterations,), and for each NAME: `NAME.sample_reward` and
+        `NAME.sample_fell` (trials, iterations), `NAME.reward`, `NAME.fell` (trials, n, seeds) and
+        `NAME.speed` (trials, n, seeds, 2).
+    """
+    evaluate_key, learn_key = jax.random.split(key)
+    arrays = {"episodes": walk.make_plan(settings).episodes(np.arange(1, settings.iterations + 1))}
+    for name, changes in CONTENDERS.items():
+        changed = dataclasses.replace(settings, **changes)
+        states, log = walk.learn_to_walk(changed, learn_key, session=session, name=name)
+        speeds, outcome = walk.walk_at_all_speeds(changed, evaluate_key, states.policy)
+        arrays["speeds"] = speeds
+        # A resumed run may have gone on for longer than is asked of it now.
+        arrays[f"{name}.sample_reward"] = log["mean_reward"][:, : settings.iterations]
+        arrays[f"{name}.sample_fell"] = log["outcome.fell"][:, : settings.iterations]
+        for field in ("reward", "fell", "speed"):
+            arrays[f"{name}.{field}"] = getattr(outcome, field)
+    return arrays
+
+
+def final_reward(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """Return the mean reward (trials,) of each trial's mean policy over all speeds and seeds."""
+    return arrays[f"{name}.reward"].mean(axis=(1, 2))
+
+
+def p_value(arrays: Mapping[str, np.ndarray], better: str, worse: str) -> float:
+    """Return how likely rewards so much in favour of `better` are if it is no better, by Wilcoxon's test."""
+    differences = final_reward(arrays, better) - final_reward(arrays, worse)
+    return float(stats.wilcoxon(differences, alternative="greater").pvalue) if differences.any() else 1.0
+
+
+def share_of_episodes(arrays: Mapping[str, np.ndarray]) -> float:
+    """Return in which share of the episodes the bounded fit gets as far as weighted ML does in all of them.
+
+    Both by the median of the trials' running mean rewards of new samples; infinite if it never does.
+    """
+    bounded, unbounded = (
+        np.median(_smoothed(arrays[f"{n}.sample_reward"]), axis=0) for n in ("rbf", "unbounded")
+    )
+    is_there = bounded >= unbounded[-1]
+    if not is_there.any():
+        return math.inf
+    last = arrays["episodes"][len(arrays["episodes"]) - len(bounded) + int(np.argmax(is_there))]
+    return float(last / arrays["episodes"][-1])
+
+
+def _smoothed(rewards: np.ndarray) -> np.ndarray:
+    width = min(_SMOOTHED, rewards.shape[1])
+    return np.lib.stride_tricks.sliding_window_view(rewards, width, axis=1).mean(axis=2)
+
+
+def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[object]]:
+    """Return Table 2 with the medians of our trials, and their falls, beside the paper's."""
+    columns: dict[str, list[object]] = {"asked m/s": [round(float(speed), 3) for speed in arrays["speeds"]]}
+    for name, label in LABELS.items():
+        columns[label] = [float(value) for value in np.median(arrays[f"{name}.reward"].mean(axis=2), axis=0)]
+        falls = arrays[f"{name}.fell"]
+        columns[f"{label}: falls"] = [f"{int(fell.sum())}/{fell.size}" for fell in np.swapaxes(falls, 0, 1)]
+    columns |= {"paper RBF": list(PAPER_RBF), "paper linear": list(PAPER_LINEAR)}
+    return columns
+
+
+def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+    """Draw Fig. 10 and 11a, and what each way came to."""
+    panels = {
+        title: {LABELS[name]: (arrays["episodes"], arrays[f"{name}.sample_reward"]) for name in names}
+        for title, names in PANELS.items()
+    }
+    missing = {label: -final_reward(arrays, name) for name, label in LABELS.items()}
+    return {
+        "learning_curve": plots.learning_curves(panels),
+        "final": plots.final_values(missing, label="what the mean reward lacks to zero", log=True),
+    }
+
+
+def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
+    """Write and say the table."""
+    del settings
+    text = to_markdown(table(arrays))
+    results.save_text(folder / "table.md", text)
+    say(text)
+
+
+CLAIMS = (
+    Claim(
+        "squashed parameters walk better than penalised ones: p of Wilcoxon's test",
+        None,
+        lambda arrays: p_value(arrays, "linear", "penalty"),
+        high=0.05,
+    ),
+    Claim(
+        "RBFs walk better than linear policies: p of the same test",
+        None,
+        lambda arrays: p_value(arrays, "rbf", "linear"),
+        high=0.05,
+    ),
+    Claim(
+        "share of episodes in which the bounded fit is as good as weighted ML after all",
+        None,
+        share_of_episodes,
+        high=0.5,
+    ),
+)
