@@ -15,7 +15,7 @@ from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
 
 __all__ = ["DualSolution", "dual_objective", "sample_kl", "sample_weights", "solve_dual"]
 
-Prior: TypeAlias = Bool[Array, " n"] | Float[Array, " n"]
+Valid: TypeAlias = Bool[Array, " n"] | Float[Array, " n"]
 
 _NUM_ROUNDS = 4
 """Most rounds of standardising and minimising, before and after the bound may be given up."""
@@ -50,7 +50,7 @@ def dual_objective(
     baseline_coef: Float[Array, " m"],
     reward: Float[Array, " n"],
     features: Float[Array, "n m"],
-    prior: Prior,
+    valid: Valid,
     kl_bound: ScalarLike,
 ) -> Scalar:
     """Evaluate the dual function of contextual REPS on samples; convex in (temperature, baseline_coef).
@@ -60,15 +60,15 @@ def dual_objective(
         baseline_coef: Coefficients w of the baseline V(s) = phi(s)' w.
         reward: Reward R of each sample.
         features: Baseline features phi of the context of each sample.
-        prior: Which samples count, or how much each does; what those hold that do not is never used.
-        kl_bound: Largest relative entropy epsilon between the weights and the prior.
+        valid: Which samples count, or how much each does; what those hold that do not is never used.
+        kl_bound: Largest relative entropy epsilon between the weights and what `valid` gives them.
 
     Returns:
-        g(eta, w) = eta epsilon + mean(phi)' w + eta log mean exp((R - phi' w) / eta), means under the prior.
+        g(eta, w) = eta epsilon + mean(phi)' w + eta log mean exp((R - phi' w) / eta), means over what counts.
 
     Source: Abdolmaleki et al. 2016, Eq. 13.
     """
-    prior = _check_samples(reward, features, prior)
+    prior = _check_samples(reward, features, valid)
     return _dual(log_temperature, baseline_coef, *_mask(reward, features, prior), kl_bound)
 
 
@@ -84,14 +84,14 @@ def _dual(
     temperature = jnp.exp(log_temperature)
     mean_features = exact_dot(prior, features)
     advantage = (reward - exact_dot(features, baseline_coef)) / temperature
-    log_mean = logsumexp(advantage, b=prior)
+    log_mean = logsumexp(advantage + _log(prior), where=prior > 0)
     return temperature * kl_bound + exact_dot(mean_features, baseline_coef) + temperature * log_mean
 
 
 def solve_dual(
     reward: Float[Array, " n"],
     features: Float[Array, "n m"],
-    prior: Prior | None = None,
+    valid: Valid | None = None,
     *,
     kl_bound: ScalarLike,
 ) -> DualSolution:
@@ -103,20 +103,20 @@ def solve_dual(
     Args:
         reward: Reward R of each sample.
         features: Baseline features phi of the context of each sample.
-        prior: Which samples count, or how much each did before its reward was seen, such as its importance
-            weight; equally by default. One whose reward or features are not finite never counts.
-        kl_bound: Largest relative entropy epsilon between the weights and the prior, above zero.
+        valid: Which samples count; all by default. As numbers: how much each counts before its reward is
+            seen, such as its importance weight. One whose reward or features are not finite never counts.
+        kl_bound: Largest relative entropy epsilon between the weights and those of `valid`, above zero.
 
     Returns:
         The solution, finite for any number of samples that count, none included. Where the bound is active,
-        the relative entropy of `sample_weights` equals it and they keep the prior's mean of the features.
+        the relative entropy of `sample_weights` equals it and they keep the mean of the features.
 
     Raises:
         ValueError: If shapes do not fit or `kl_bound` is not a positive number.
 
     Source: Abdolmaleki et al. 2016, Eq. 12 and 13.
     """
-    prior = _check_samples(reward, features, prior)
+    prior = _check_samples(reward, features, valid)
     if not isinstance(kl_bound, Tracer) and not 0.0 < float(kl_bound) < math.inf:
         raise ValueError(f"kl_bound has to be a positive number, got {kl_bound}")
     kl_bound = jnp.asarray(kl_bound, reward.dtype)
@@ -131,7 +131,7 @@ def solve_dual(
         is_active=guess.is_active,
     )
     # The quality is that of the weights as the caller gets them, with the rounding of the solution.
-    weights = sample_weights(solution, reward, features, prior)
+    weights = sample_weights(solution, reward, features, valid)
     excess = sample_kl(weights, samples.prior * jnp.any(weights > 0).astype(weights.dtype)) - kl_bound
     excess = jnp.where(guess.is_active, excess, jnp.maximum(excess, 0.0))
     mismatch = exact_dot(weights - samples.prior, samples.whitened)
@@ -142,16 +142,16 @@ def sample_weights(
     solution: DualSolution,
     reward: Float[Array, " n"],
     features: Float[Array, "n m"],
-    prior: Prior | None = None,
+    valid: Valid | None = None,
 ) -> Float[Array, " n"]:
-    """Weigh the samples by exp((R - V(s)) / eta), times their prior.
+    """Weigh the samples by exp((R - V(s)) / eta), times how much they count before.
 
     Args:
         solution: Temperature eta and baseline coefficients w, from `solve_dual` on the same samples.
         reward: Reward R of each sample.
         features: Baseline features phi of the context of each sample.
-        prior: Which samples count, or how much each did before its reward was seen, such as its importance
-            weight; equally by default. One whose reward or features are not finite never counts.
+        valid: Which samples count; all by default. As numbers: how much each counts before its reward is
+            seen, such as its importance weight. One whose reward or features are not finite never counts.
 
     Returns:
         Weights that sum to one, zero where a sample does not count; all zero if none does.
@@ -161,7 +161,7 @@ def sample_weights(
 
     Source: Abdolmaleki et al. 2016, the solution p(s, theta) below Eq. 12.
     """
-    prior = _check_samples(reward, features, prior)
+    prior = _check_samples(reward, features, valid)
     is_counted = _is_counted(reward, features, prior)
     reward, features, prior = _mask(reward, features, prior)
     shifted, centred = _shift(reward, prior), centre_columns(features, prior)
@@ -169,29 +169,27 @@ def sample_weights(
     return jnp.where(is_counted, _softmax(advantage, prior), 0.0)
 
 
-def sample_kl(weights: Float[Array, " n"], prior: Prior | None = None) -> Scalar:
-    """Return the relative entropy between weights and the prior of the samples.
+def sample_kl(weights: Float[Array, " n"], valid: Valid | None = None) -> Scalar:
+    """Return the relative entropy between weights and uniform ones, or those that the samples had before.
 
     Args:
         weights: Weights d that sum to one, zero where a sample does not count.
-        prior: Which samples count, or how much each did before its reward was seen; equally by default.
+        valid: Which samples count, all by default; as numbers, how much each did before its reward was seen.
 
     Returns:
-        sum d log(d / p) with the prior p, scaled to a sum of one; with an equal one between 0 and log n.
+        sum d log(d / p), where p is `valid`, scaled to a sum of one; between 0 and log n if it is uniform.
 
     Raises:
         ValueError: If the shapes differ.
     """
-    prior = jnp.ones(weights.shape, weights.dtype) if prior is None else prior.astype(weights.dtype)
+    prior = jnp.ones(weights.shape, weights.dtype) if valid is None else valid.astype(weights.dtype)
     if weights.shape != prior.shape:
-        raise ValueError(f"weights and prior have to have one shape, got {weights.shape} and {prior.shape}")
+        raise ValueError(f"weights and valid have to have one shape, got {weights.shape} and {prior.shape}")
     prior = _normalised(prior)
-    # As a mean of x log x - x + 1, x = d / p, whose terms are not negative: sum d log(d / p) would cancel.
+    # By terms of d log(d / p) - d + p, which are not negative: those of sum d log(d / p) would cancel.
     change = weights / jnp.where(prior > 0, prior, 1.0) - 1.0
-    is_weighted = change > -1.0
-    change = jnp.where(is_weighted, change, 0.0)
-    terms = jnp.where(is_weighted, (1.0 + change) * jnp.log1p(change) - change, 1.0)
-    return exact_dot(prior, terms)
+    log_ratio = jnp.log1p(jnp.where(change > -1.0, change, 0.0))
+    return jnp.sum(weights * log_ratio - prior * change, where=prior > 0)
 
 
 class _Samples(NamedTuple):
@@ -330,7 +328,16 @@ def _advantage(samples: _Samples, temperature: Array, baseline_coef: Array) -> A
 
 
 def _softmax(advantage: Array, prior: Array) -> Array:
-    return _normalised(prior * jnp.exp(_shift(advantage, prior)))
+    return jax.nn.softmax(jnp.where(prior > 0, advantage + _log(prior), -jnp.inf))
+
+
+def _log(prior: Array) -> Array:
+    """Return logarithms, zero where a sample does not count.
+
+    They belong into the exponent: times the exponential, a small prior with a large advantage makes all other
+    terms underflow.
+    """
+    return jnp.log(jnp.where(prior > 0, prior, 1.0))
 
 
 def _shift(values: Array, prior: Array) -> Array:
@@ -354,8 +361,10 @@ def _mask(reward: Array, features: Array, prior: Array) -> tuple[Array, Array, A
 
 def _normalised(weights: Array) -> Array:
     """Scale weights, if there are any, to a sum of one; those that are too small for the format get zero."""
-    total = jnp.sum(weights)
-    weights = weights / jnp.where(total > 0, total, 1.0)
+    # By the largest first: a sum of large ones overflows.
+    largest = jnp.max(weights)
+    weights = weights / jnp.where(largest > 0, largest, 1.0)
+    weights = weights / jnp.maximum(jnp.sum(weights), 1.0)
     return jnp.where(weights >= jnp.finfo(weights.dtype).tiny, weights, 0.0)
 
 
@@ -363,11 +372,11 @@ def _is_counted(reward: Array, features: Array, prior: Array) -> Array:
     return (prior > 0) & jnp.isfinite(prior) & jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
 
 
-def _check_samples(reward: Array, features: Array, prior: Array | None) -> Array:
-    """Return the prior of the samples, an equal one by default, after checking shapes."""
+def _check_samples(reward: Array, features: Array, valid: Array | None) -> Array:
+    """Return how much each sample counts, by default equally, after checking shapes."""
     if reward.ndim != 1 or features.ndim != 2 or features.shape[0] != reward.shape[0] or 0 in features.shape:
         raise ValueError(f"need reward (n,) and features (n, m), got shapes {reward.shape}, {features.shape}")
-    prior = jnp.ones(reward.shape, reward.dtype) if prior is None else prior.astype(reward.dtype)
+    prior = jnp.ones(reward.shape, reward.dtype) if valid is None else valid.astype(reward.dtype)
     if prior.shape != reward.shape:
-        raise ValueError(f"prior has to have the shape of reward, {reward.shape}, got {prior.shape}")
+        raise ValueError(f"valid has to have the shape of reward, {reward.shape}, got {prior.shape}")
     return prior

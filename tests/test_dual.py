@@ -352,7 +352,7 @@ def test_gradients_do_not_see_masked_samples():
     features = jnp.where(valid[:, None], jnp.float32(features), jnp.nan)
     solution, _ = solve(reward, features, valid, jnp.float32(0.5))
     coef = solution.baseline_coef
-    objective = partial(dual_objective, prior=valid, kl_bound=0.5)
+    objective = partial(dual_objective, valid=valid, kl_bound=0.5)
     by_all = jax.jit(jax.grad(objective, (0, 1, 2, 3)))(jnp.log(solution.temperature), coef, reward, features)
     first_weight = jax.jit(jax.grad(lambda *args: sample_weights(solution, *args, valid)[0], (0, 1)))
     by_weights = first_weight(reward, features)
@@ -422,3 +422,26 @@ def test_a_prior_counts_a_sample_as_often_as_copies_of_it(key):
     np.testing.assert_allclose(weights, summed, rtol=1e-3, atol=1e-6)
     assert solution.grad_norm < 1e-4
     np.testing.assert_allclose(sample_kl(weights, copies.astype(jnp.float32)), 0.5, rtol=1e-3)
+
+
+@pytest.mark.parametrize("small", [1e-10, 1e-20, 1e-37])
+@pytest.mark.parametrize("gap", [1.0, 10.0, 100.0])
+def test_a_small_prior_with_a_large_reward_breaks_nothing(key, small, gap):
+    reward = jax.random.normal(key, (NUM,)).at[0].set(gap)
+    features = jax.random.normal(jax.random.fold_in(key, 1), (NUM, 2))
+    prior = jnp.ones(NUM).at[0].set(small)
+    solution = solve_dual(reward, features, prior, kl_bound=0.5)
+    weights = sample_weights(solution, reward, features, prior)
+    np.testing.assert_allclose(sample_kl(weights, prior), 0.5, rtol=1e-3)
+    assert solution.is_active and solution.grad_norm < 1e-3
+    variables = jnp.zeros(3)
+    hessian = jax.hessian(lambda x: dual_objective(x[0], x[1:], reward, features, prior, 0.5))(variables)
+    assert jnp.isfinite(hessian).all()
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e37])
+def test_the_scale_of_a_prior_does_not_matter(key, scale):
+    reward, features = jax.random.normal(key, (NUM,)), jnp.linspace(-1.0, 1.0, NUM)[:, None]
+    expected = solve_dual(reward, features, kl_bound=0.5)
+    found = solve_dual(reward, features, jnp.full(NUM, scale), kl_bound=0.5)
+    np.testing.assert_allclose(found.temperature, expected.temperature, rtol=1e-4)
