@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from creps_jax import tasks
 from creps_jax.archive import Archive, Batch
-from creps_jax.constraints import sigmoid_gate, sigmoid_gate_inverse
+from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
 from creps_jax.creps import Creps, CrepsInfo, CrepsState, creps
 from creps_jax.dual import DualSolution, sample_weights, solve_dual
@@ -63,7 +63,6 @@ __all__ = [
     "sample_weights",
     "sigmoid_constrained",
     "sigmoid_gate",
-    "sigmoid_gate_inverse",
     "sinus",
     "solve_dual",
     "tasks",

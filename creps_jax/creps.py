@@ -6,6 +6,7 @@ robot, calls `ask`, measures, and calls `tell`; `creps_jax.train` does so for a 
 
 import dataclasses
 import math
+import numbers
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from creps_jax.dual import DualSolution, sample_kl, sample_weights, solve_dual
 from creps_jax.features import FeatureMap
 from creps_jax.importance import Importance, PolicyHistory, empty_history, importance_weights, remember
 from creps_jax.linalg import exact_dot
-from creps_jax.mstep import MStep, WeightedSamples, weighted_ml
+from creps_jax.mstep import MStep, WeightedSamples, bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar
 
@@ -57,7 +58,8 @@ class CrepsInfo(NamedTuple):
     entropy: Scalar
     """Differential entropy of the new policy, in nats."""
     num_valid: IntScalar
-    """How many archived samples the update was made from; those that are not finite are left out."""
+    """How many archived samples the update was made from; those that are not finite are left out, and those
+    of policies that the history no longer holds."""
     is_updated: Bool[Array, ""]
     """False where the policy was kept, because there were too few samples to fit one."""
 
@@ -119,11 +121,22 @@ def creps(
     Source: Abdolmaleki et al. 2016, Section 3.1.
     """
     _check_settings(policy_features, baseline_features, kl_bound, archive_size, ridge)
+    if importance is not None and not isinstance(importance, Importance):
+        raise ValueError(f"importance must be an Importance or None, got {importance!r}")
+    if m_step is bounded_ml:
+        raise ValueError(
+            "m_step must be an M-step, such as bounded_ml(), got bounded_ml without its parentheses"
+        )
     context_dim = policy_features.context_dim
     scale = None if policy_features.scale is None else jnp.asarray(policy_features.scale, jnp.float32)
 
     def init(policy: LinearGaussian) -> CrepsState:
         theta_dim = _checked_theta_dim(policy, policy_features)
+        least = policy_features.size + theta_dim
+        if archive_size < least:
+            raise ValueError(
+                f"archive_size must be at least {least}, features and parameters, got {archive_size}"
+            )
         archive = empty_archive(archive_size, context_dim, theta_dim)
         policy = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), policy)
         history = None if importance is None else empty_history(policy, importance.num_policies)
@@ -142,20 +155,9 @@ def creps(
         samples = jax.tree.map(lambda x: jnp.where(_along(is_valid, x), x, 0.0), archive.batch)
 
         features = jax.vmap(policy_features.apply)(samples.context)
-        prior, history = is_valid.astype(jnp.float32), _checked_history(state, importance)
-        if importance is not None and history is not None:
-            history = remember(history, state.policy, state.iteration)
-            prior = importance_weights(
-                state.policy,
-                history,
-                features,
-                samples.theta,
-                archive.age,
-                is_valid,
-                state.iteration,
-                least_effective=importance.least_effective,
-            )
-            is_valid = prior > 0
+        if importance is not None:
+            is_valid = is_valid & (archive.age < importance.num_policies)
+        prior, history = _prior(state, importance, features, samples.theta, archive.age, is_valid)
 
         baseline = jax.vmap(baseline_features.apply)(samples.context)
         dual = solve_dual(samples.reward, baseline, prior, kl_bound=kl_bound)  # Eq. (13)
@@ -246,12 +248,27 @@ def _checked_batch(batch: Batch, archive: Archive) -> Batch:
     return Batch(context, theta, reward)
 
 
-def _checked_history(state: CrepsState, importance: Importance | None) -> PolicyHistory | None:
+def _prior(
+    state: CrepsState,
+    importance: Importance | None,
+    features: Array,
+    theta: Array,
+    age: Array,
+    is_valid: Array,
+) -> tuple[Array, PolicyHistory | None]:
+    """Return how much each sample counts before rewards are looked at, and the history with this policy."""
     expected = 0 if importance is None else importance.num_policies
     got = 0 if state.history is None else state.history.coef.shape[0]
     if got != expected:
         raise ValueError(f"the state must hold the last {expected} policies, as `init` makes it, got {got}")
-    return state.history
+    if importance is None or state.history is None:
+        return is_valid.astype(jnp.float32), None
+    policy, iteration = state.policy, state.iteration
+    history = remember(state.history, policy, iteration)
+    weights = importance_weights(
+        policy, history, features, theta, age, is_valid, iteration, least_effective=importance.least_effective
+    )
+    return weights, history
 
 
 def _checked_theta_dim(policy: LinearGaussian, policy_features: FeatureMap) -> int:
@@ -278,7 +295,7 @@ def _check_settings(
         )
     if not (kl_bound > 0 and math.isfinite(kl_bound)):
         raise ValueError(f"kl_bound must be positive and finite, got {kl_bound}")
-    if archive_size < 1:
-        raise ValueError(f"archive_size must be at least 1, got {archive_size}")
+    if not isinstance(archive_size, numbers.Integral) or archive_size < 1:
+        raise ValueError(f"archive_size must be an integer of at least 1, got {archive_size!r}")
     if not (ridge >= 0 and math.isfinite(ridge)):
         raise ValueError(f"ridge must be finite and not negative, got {ridge}")

@@ -11,6 +11,7 @@ from creps_jax.archive import Batch
 from creps_jax.creps import CrepsState, creps
 from creps_jax.dual import sample_weights
 from creps_jax.features import linear_features, quadratic_features, rbf_features
+from creps_jax.mstep import bounded_ml
 from creps_jax.policy import LinearGaussian
 
 ARCHIVE_SIZE, NUM, THETA_DIM = 60, 40, 2
@@ -166,9 +167,10 @@ def test_takes_any_features_and_several_contexts(key):
     [
         ({"kl_bound": 0}, "kl_bound must be positive and finite, got 0"),
         ({"kl_bound": float("nan")}, "got nan"),
-        ({"archive_size": 0}, "archive_size must be at least 1, got 0"),
+        ({"archive_size": 0}, "archive_size must be an integer of at least 1, got 0"),
         ({"ridge": -1.0}, "ridge must be finite and not negative, got -1.0"),
         ({"baseline_features": linear_features(3)}, "same context, got 1 and 3"),
+        ({"m_step": bounded_ml}, r"such as bounded_ml\(\), got bounded_ml without its parentheses"),
     ],
 )
 def test_refuses_settings_out_of_range(settings, message):
@@ -188,6 +190,12 @@ def test_refuses_settings_out_of_range(settings, message):
 def test_refuses_a_policy_that_does_not_fit(coef, cov_chol, message):
     with pytest.raises(ValueError, match=message):
         ALGORITHM.init(LinearGaussian(jnp.zeros(coef), jnp.ones(cov_chol)))
+
+
+def test_refuses_an_archive_that_no_policy_could_be_fitted_to():
+    algorithm = creps(linear_features(1), quadratic_features(1), archive_size=4)
+    with pytest.raises(ValueError, match="at least 5, features and parameters, got 4"):
+        algorithm.init(LinearGaussian(jnp.zeros((2, 3)), jnp.eye(3)))
 
 
 @pytest.mark.parametrize("shape", [(1,), (4, 2), (0, 1), (4, 1, 1)])

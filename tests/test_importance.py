@@ -88,38 +88,54 @@ def test_without_valid_samples_there_are_no_weights(key):
     assert (weights_of(key, num_valid=0) == 0).all()
 
 
-def told(algorithm, key, rounds, offset=0.0):
-    """Ask and tell a few times; the best thetas are the context."""
+def told(algorithm, key, rounds, is_failed=()):
+    """Ask and tell a few times; the best thetas are the context. Return what was told in each round, too."""
     state = algorithm.init(LinearGaussian(jnp.zeros((2, DIM)), jnp.eye(DIM)))
-    infos = []
+    infos, past = [], []
     for number in range(rounds):
         context_key, theta_key = jax.random.split(jax.random.fold_in(key, number))
         contexts = jax.random.uniform(context_key, (30, 1))
         thetas = algorithm.ask(theta_key, state, contexts)
-        state, info = algorithm.tell(
-            state, Batch(contexts, thetas, -jnp.sum((thetas - contexts) ** 2, axis=1))
-        )
+        reward = -jnp.sum((thetas - contexts) ** 2, axis=1)
+        reward = reward.at[jnp.array(is_failed, int)].set(jnp.nan)
+        past.append((state.policy, contexts, thetas))
+        state, info = algorithm.tell(state, Batch(contexts, thetas, reward))
         infos.append(info)
-    return state, infos
+    return state, infos, past
+
+
+@pytest.mark.parametrize("is_failed", [(), (0, 7, 8)])
+def test_an_update_weighs_each_sample_by_the_policy_it_was_drawn_from(key, is_failed):
+    """After more rounds than policies are kept: the places of all have been written anew."""
+    _, infos, past = told(WEIGHTED, key, 5, is_failed)
+    works = [i for i in range(30) if i not in is_failed]
+    kept = past[-NUM_POLICIES:]
+    features = np.concatenate([np.column_stack([np.ones(len(works)), c[works, 0]]) for _, c, _ in kept])
+    theta = np.concatenate([thetas[np.array(works)] for _, _, thetas in kept])
+    each = [densities(policy, features, theta) for policy, _, _ in kept]
+    weights = each[-1] / np.mean(each, axis=0)
+    expected = weights.sum() ** 2 / (weights**2).sum()
+    assert 50.0 < expected < 0.95 * len(theta)
+    np.testing.assert_allclose(infos[-1].prior_effective_samples, expected, rtol=1e-3)
+    assert infos[-1].num_valid == NUM_POLICIES * len(works)
 
 
 def test_samples_of_one_policy_count_equally(key):
-    (_, (weighted,)), (_, (plain,)) = told(WEIGHTED, key, 1), told(PLAIN, key, 1)
+    (_, (weighted,), _), (_, (plain,), _) = told(WEIGHTED, key, 1), told(PLAIN, key, 1)
     np.testing.assert_allclose(weighted.prior_effective_samples, 30, rtol=1e-5)
     for name in ("kl", "policy_kl", "effective_samples", "entropy"):
         np.testing.assert_allclose(getattr(weighted, name), getattr(plain, name), rtol=1e-3)
 
 
 def test_samples_of_forgotten_policies_are_left_out(key):
-    state, infos = told(WEIGHTED, key, 5)
+    state, infos, _ = told(WEIGHTED, key, 5)
     assert [int(info.num_valid) for info in infos] == [30, 60, 90, 90, 90]
     assert state.archive.age[:150].max() == 4
-    assert infos[-1].prior_effective_samples < 90
     assert all(abs(info.kl - 0.5) < 1e-3 for info in infos)
 
 
 def test_a_state_of_another_setting_is_refused(key):
-    state, _ = told(PLAIN, key, 1)
+    state, _, _ = told(PLAIN, key, 1)
     with pytest.raises(ValueError, match="the last 3 policies, as `init` makes it, got 0"):
         WEIGHTED.tell(state, Batch(jnp.zeros((3, 1)), jnp.zeros((3, DIM)), jnp.zeros(3)))
 

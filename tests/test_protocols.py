@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import creps_jax
 from creps_jax import tasks
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.features import linear_features, quadratic_features, rbf_features
@@ -144,3 +145,7 @@ def test_mujoco_is_imported_only_for_the_walking_task_which_stays_a_function(ord
     code = f"import sys; {IMPORT_ORDERS[order]}; from creps_jax import tasks; {check}"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
+
+
+def test_the_library_has_at_most_forty_names():
+    assert len(creps_jax.__all__) == len(set(creps_jax.__all__)) <= 40
