@@ -163,6 +163,10 @@ def _resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Pa
         settings = experiment.Settings(**_as_tuples(manifest["settings"]))
     except TypeError as error:
         raise UserError(f"{folder} was made with other settings than this version has: {error}") from error
+    for name, asked in request.overrides.items():
+        there = getattr(settings, name, None)
+        if name != "iterations" and asked != there:
+            raise UserError(f"{folder} has {name} {there!r}, not {asked!r}; leave it out to resume")
     settings = _override(settings, request)
     manifest["settings"] = dataclasses.asdict(settings)
     return settings, folder, manifest

@@ -100,6 +100,7 @@ def test_mistakes_in_a_request_are_named_and_change_nothing(tiny):
         ("file is a file", {"out": Path("file")}),
         ("empty is no result folder", {"out": Path("empty"), "resume": True}),
         ("has seed 0, not 5", {"out": Path("done"), "resume": True, "seed": 5}),
+        ("trials 2, not 3", {"out": Path("done"), "resume": True, "overrides": {"trials": 3}}),
         ("has preset 'quick', not 'long'", {"out": Path("done"), "resume": True, "preset": "long"}),
         ("iterations must be at least 1, got 0", {"overrides": {"iterations": 0}}),
         ("tiny has no setting 'samples'", {"overrides": {"samples": 3}}),
