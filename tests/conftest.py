@@ -40,6 +40,17 @@ def relaxed_promotion():
         yield
 
 
+@pytest.fixture(autouse=True, scope="module")
+def few_compiled_programs():
+    """Drop compiled programs after each file of tests.
+
+    A program takes a dozen memory maps or more, of which Linux gives a process 65,530: of the thousands of
+    programs of all tests, the last ones ended in a segmentation fault.
+    """
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def key() -> jax.Array:
     """Return the key that tests without a seed of their own start from."""
