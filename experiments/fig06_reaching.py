@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
-from creps_jax.features import linear_features, quadratic_features, rbf_features
+from creps_jax.features import FeatureMap, linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, via_point_movement, via_point_reaching
 from experiments import plots
 from experiments.comparison import (
@@ -51,14 +51,15 @@ SETTINGS = {"paper": Settings(), "quick": Settings(iterations=200, trials=5)}
 def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
     """Learn with linear and RBF features, with quadratic ones, and with uniform contexts.
 
-    The paper has no quadratic policies. They can do all that linear ones can: where they are worse, it is
-    not what features can express that matters, but how many coefficients there are to learn.
+    The paper has no quadratic policies. Theirs are the linear features and the squares of the contexts: they
+    can do all that linear ones can. Where they are worse, it is not what features can express that matters,
+    but how many coefficients there are to learn.
 
     Returns:
         The arrays of `compare`, with the contenders linear, rbf, quadratic and uniform.
     """
-    quadratic = quadratic_features(2)
-    linear = (linear_features(2), quadratic)
+    linear = (linear_features(2), quadratic_features(2))
+    quadratic = _linear_and_squares()
     rbf = rbf_features(LOW, HIGH, settings.num_centers)
     gaussian, uniform = gaussian_contexts(LOW, HIGH, clip=True), uniform_contexts(LOW, HIGH)
     contenders = {
@@ -80,6 +81,17 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
             lambda theta: jax.vmap(arm_points)(via_point_movement(theta).pos),
         )
     return arrays
+
+
+def _linear_and_squares() -> FeatureMap:
+    """Make the features [1, u, u^2] of contexts u that are scaled to [-1, 1]."""
+    middle, half = (0.5 * (np.array(HIGH) + sign * np.array(LOW)) for sign in (1, -1))
+
+    def apply(context: jax.Array) -> jax.Array:
+        scaled = (context - jnp.asarray(middle, context.dtype)) / jnp.asarray(half, context.dtype)
+        return jnp.concatenate([jnp.ones_like(scaled[:1]), scaled, scaled**2])
+
+    return FeatureMap(apply, 5, 2)
 
 
 def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
