@@ -1,8 +1,9 @@
 """Reach into a hole with a planar arm (Abdolmaleki et al. 2016, 4.2, Fig. 8 and 9)."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 from creps_jax.contexts import context_grid
 from creps_jax.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, hole_movement, hole_reaching
-from experiments import plots
+from experiments import plots, results
 from experiments.comparison import (
     Contender,
     LearnerSettings,
@@ -27,6 +28,7 @@ from experiments.comparison import (
 from experiments.errors import UserError
 from experiments.learning import Session
 from experiments.registry import Claim
+from experiments.tables import to_markdown
 
 LOW, HIGH = 1.4, 2.0
 WIDTH, DEPTH = 0.3, 1.0
@@ -103,6 +105,30 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
         "final": plots.final_values(last_regrets(arrays, labels), label="regret over the grid", log=True),
         "postures": figure,
     }
+
+
+def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
+    """Return shares of trials and holes that collide, of all and of the ends, and the reward elsewhere."""
+    columns: dict[str, list[str]] = {
+        "policy": _names(arrays),
+        "collides": [],
+        "at the ends": [],
+        "else": [],
+    }
+    for name in _names(arrays):
+        collides, reward = arrays[f"{name}.collides"], arrays[f"{name}.grid_reward"][:, -1]
+        columns["collides"].append(f"{collides.mean():.0%}")
+        columns["at the ends"].append(f"{collides[:, [0, 1, 2, -3, -2, -1]].mean():.0%}")
+        columns["else"].append("" if collides.all() else f"{np.median(reward[~collides]):,.0f}")
+    return columns
+
+
+def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
+    """Write and say the table."""
+    del settings
+    text = to_markdown(table(arrays))
+    results.save_text(folder / "table.md", text)
+    say(text)
 
 
 def _names(arrays: Mapping[str, np.ndarray]) -> list[str]:

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import comparison, updates
+from experiments import comparison, fig08_hole, updates
 from experiments.errors import UserError
 from experiments.fig08_hole import Settings as HoleSettings
 from experiments.learning import Session
@@ -81,6 +81,20 @@ def test_updates_are_compared_on_the_same_problem(monkeypatch, tmp_path):
     assert set(updates.plot(arrays)) == {"learning_curves", "sphere_updates"}
     updates.finish(settings, arrays, tmp_path, said.append)
     assert (tmp_path / "table.md").read_text() == said[0] and "sphere" in said[0]
+
+
+def test_the_table_of_the_hole_tells_collisions_from_what_is_left():
+    collides = np.zeros((2, 25), bool)
+    collides[:, 0] = True
+    reward = np.where(collides, -1e7, -5e3)[:, None]
+    arrays = {"linear.coef": reward, "linear.collides": collides, "linear.grid_reward": reward}
+    arrays |= {"rbf6.coef": reward, "rbf6.collides": np.ones((2, 25), bool), "rbf6.grid_reward": reward}
+    assert fig08_hole.table(arrays) == {
+        "policy": ["linear", "rbf6"],
+        "collides": ["4%", "100%"],
+        "at the ends": ["17%", "100%"],
+        "else": ["-5,000", ""],
+    }
 
 
 def test_the_hole_needs_the_number_of_rbfs_of_the_paper():
