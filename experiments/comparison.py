@@ -1,6 +1,7 @@
 """Compare ways to learn: trials of each, judged by their mean policies on one grid of contexts."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
@@ -165,8 +166,26 @@ def p_value(arrays: Mapping[str, np.ndarray], better: str, worse: str) -> float:
 
     This is Wilcoxon's signed-rank test: trials of one number share their key, and so make pairs.
     """
-    differences = regret(arrays, better) - regret(arrays, worse)
-    return float(stats.wilcoxon(differences, alternative="less").pvalue) if differences.any() else 1.0
+    return signed_rank_p(regret(arrays, worse) - regret(arrays, better))
+
+
+def signed_rank_p(gains: np.ndarray) -> float:
+    """Return how likely gains (pairs,) so much above zero are if there are none, by Wilcoxon's test."""
+    return float(stats.wilcoxon(gains, alternative="greater").pvalue) if gains.any() else 1.0
+
+
+def share_of_episodes(episodes: np.ndarray, curve: np.ndarray, reference: np.ndarray) -> float:
+    """Return in which share of the episodes a curve gets as far as another does in all of them.
+
+    Both by the median of the trials; infinite if it never does.
+
+    Args:
+        episodes: (k,) rollouts so far.
+        curve: (trials, k) rewards.
+        reference: (trials, k) rewards of the other.
+    """
+    is_there = np.median(curve, axis=0) >= np.median(reference[:, -1])
+    return float(episodes[is_there][0] / episodes[-1]) if is_there.any() else math.inf
 
 
 def mean_thetas(contender: Contender, coef: np.ndarray | jax.Array, contexts: jax.Array) -> jax.Array:

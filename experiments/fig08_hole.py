@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from creps_jax.contexts import context_grid
 from creps_jax.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, hole_movement, hole_reaching
-from experiments import plots, results
+from experiments import plots
 from experiments.comparison import (
     Contender,
     LearnerSettings,
@@ -28,7 +28,7 @@ from experiments.comparison import (
 from experiments.errors import UserError
 from experiments.learning import Session
 from experiments.registry import Claim
-from experiments.tables import to_markdown
+from experiments.tables import save_table
 
 LOW, HIGH = 1.4, 2.0
 WIDTH, DEPTH = 0.3, 1.0
@@ -126,9 +126,7 @@ def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
 def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
     """Write and say the table."""
     del settings
-    text = to_markdown(table(arrays))
-    results.save_text(folder / "table.md", text)
-    say(text)
+    save_table(table(arrays), folder, say)
 
 
 def _names(arrays: Mapping[str, np.ndarray]) -> list[str]:

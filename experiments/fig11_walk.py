@@ -1,7 +1,6 @@
 """Compare ways to learn to walk (Abdolmaleki et al. 2016, 4.3, Fig. 10, 11a and Table 2)."""
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,13 +8,13 @@ from typing import Any
 import jax
 import numpy as np
 from matplotlib.figure import Figure
-from scipy import stats
 
-from experiments import plots, results, walk
+from experiments import comparison, plots, walk
+from experiments.comparison import signed_rank_p
 from experiments.learning import Session
 from experiments.policy_file import Features
 from experiments.registry import Claim
-from experiments.tables import PAPER_LINEAR, PAPER_RBF, to_markdown
+from experiments.tables import PAPER_LINEAR, PAPER_RBF, save_table
 
 CONTENDERS: dict[str, dict[str, Any]] = {
     "rbf": {},
@@ -72,23 +71,13 @@ def final_reward(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
 
 def p_value(arrays: Mapping[str, np.ndarray], better: str, worse: str) -> float:
     """Return how likely rewards so much in favour of `better` are if it is no better, by Wilcoxon's test."""
-    differences = final_reward(arrays, better) - final_reward(arrays, worse)
-    return float(stats.wilcoxon(differences, alternative="greater").pvalue) if differences.any() else 1.0
+    return signed_rank_p(final_reward(arrays, better) - final_reward(arrays, worse))
 
 
 def share_of_episodes(arrays: Mapping[str, np.ndarray]) -> float:
-    """Return in which share of the episodes the bounded fit gets as far as weighted ML does in all of them.
-
-    Both by the median of the trials' running mean rewards of new samples; infinite if it never does.
-    """
-    bounded, unbounded = (
-        np.median(_smoothed(arrays[f"{n}.sample_reward"]), axis=0) for n in ("rbf", "unbounded")
-    )
-    is_there = bounded >= unbounded[-1]
-    if not is_there.any():
-        return math.inf
-    last = arrays["episodes"][len(arrays["episodes"]) - len(bounded) + int(np.argmax(is_there))]
-    return float(last / arrays["episodes"][-1])
+    """Return in which share of the episodes bounded samples are as good as weighted ML's after all."""
+    bounded, unbounded = (_smoothed(arrays[f"{name}.sample_reward"]) for name in ("rbf", "unbounded"))
+    return comparison.share_of_episodes(arrays["episodes"][-bounded.shape[1] :], bounded, unbounded)
 
 
 def _smoothed(rewards: np.ndarray) -> np.ndarray:
@@ -123,9 +112,7 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
 def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
     """Write and say the table."""
     del settings
-    text = to_markdown(table(arrays))
-    results.save_text(folder / "table.md", text)
-    say(text)
+    save_table(table(arrays), folder, say)
 
 
 CLAIMS = (

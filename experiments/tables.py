@@ -2,9 +2,12 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
+
+from experiments import results
 
 # Table 2 of Abdolmaleki et al. 2016: speed asked for (m/s), and the rewards of both policies.
 PAPER_SPEEDS = (0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.45, 0.50, 0.55, 0.60)
@@ -43,6 +46,13 @@ def to_markdown(columns: Mapping[str, Sequence[object]]) -> str:
 
     rule = "|" + "|".join("-" * (width + 1) + ":" for width in widths) + "|"
     return "\n".join([line(list(columns)), rule, *map(line, rows)]) + "\n"
+
+
+def save_table(columns: Mapping[str, Sequence[object]], folder: Path, say: Callable[[str], None]) -> None:
+    """Write a table into a result folder as Markdown, and say it."""
+    text = to_markdown(columns)
+    results.save_text(folder / "table.md", text)
+    say(text)
 
 
 def speed_table(

@@ -22,11 +22,11 @@ from creps_jax.contexts import context_grid
 from creps_jax.features import FeatureMap, linear_features, rbf_features
 from creps_jax.tasks import Task, contextual_function, hole_reaching, sinus, via_point_reaching
 from creps_jax.tasks.functions import ackley, ellipsoid, rastrigin, rosenbrock, sphere
-from experiments import plots, results
+from experiments import comparison, plots
 from experiments.comparison import Contender, LearnerSettings, compare, make_contender, mean_policy_curve
 from experiments.learning import Session
 from experiments.registry import Claim
-from experiments.tables import to_markdown
+from experiments.tables import save_table
 
 LABELS = {
     "plain": "weighted ML, no archive",
@@ -173,15 +173,11 @@ def fits(arrays: Mapping[str, np.ndarray], bench: str) -> dict[str, str]:
 
 
 def share_of_episodes(arrays: Mapping[str, np.ndarray], bench: str) -> float:
-    """Return in which share of the episodes the bounded fit gets as far as the paper's does in all of them.
-
-    Both by the median of the trials' mean policies; infinite if it never does.
-    """
+    """Return in which share of the episodes the bounded fit is as good as the paper's after all of them."""
     found = of_bench(arrays, bench)
     episodes, bounded = mean_policy_curve(found, f"{bench}-bounded")
     _, archive = mean_policy_curve(found, f"{bench}-archive")
-    is_there = np.median(bounded, axis=0) >= np.median(archive[:, -1])
-    return float(episodes[is_there][0] / episodes[-1]) if is_there.any() else math.inf
+    return comparison.share_of_episodes(episodes, bounded, archive)
 
 
 def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
@@ -221,9 +217,7 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
 def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
     """Write and say the table."""
     del settings
-    text = to_markdown(table(arrays))
-    results.save_text(folder / "table.md", text)
-    say(text)
+    save_table(table(arrays), folder, say)
 
 
 def _last_samples(arrays: Mapping[str, np.ndarray], contender: str) -> float:
