@@ -12,22 +12,23 @@ import numpy as np
 from creps_jax.constraints import sigmoid_gate
 from creps_jax.features import FeatureMap, linear_features, rbf_features
 from creps_jax.policy import LinearGaussian
+from creps_jax.typing import VectorLike
 from experiments.errors import UserError
 from experiments.results import ROOT, load_arrays, save_arrays
 
 FORMAT = "creps_jax policy"
-VERSION = 1
+VERSION = 2
 FEATURE_KINDS = ("linear", "rbf")
 CONSTRAINTS = ("none", "sigmoid", "penalty")
 
 
 @dataclasses.dataclass(frozen=True)
 class Features:
-    """Settings of the features of a policy of one context.
+    """Settings of the features of a policy.
 
     Attributes:
         kind: one of FEATURE_KINDS.
-        num_centers: K, for RBFs.
+        num_centers: K along each context variable, for RBFs.
         bandwidth: width of the RBFs in context units; None is the default width.
     """
 
@@ -35,14 +36,14 @@ class Features:
     num_centers: int = 5
     bandwidth: float | None = None
 
-    def make(self, low: float, high: float) -> FeatureMap:
-        """Return the features over a range of contexts.
+    def make(self, low: VectorLike, high: VectorLike) -> FeatureMap:
+        """Return the features over a range of contexts: a number, or one for each context variable.
 
         Raises:
             UserError: if the kind is unknown.
         """
         if self.kind == "linear":
-            return linear_features(1)
+            return linear_features(np.size(low))
         if self.kind == "rbf":
             return rbf_features(low, high, self.num_centers, bandwidth=self.bandwidth)
         raise UserError(f"features must be one of {', '.join(FEATURE_KINDS)}, got {self.kind!r}")
@@ -56,7 +57,7 @@ class SavedPolicy:
         coef: (p, d) mean is features @ coef.
         cov_chol: (d, d) Cholesky factor of the covariance.
         features: the features of the context.
-        context_name: what the context is, with `context_unit`, `context_low` and `context_high`.
+        context_names: what the s context variables are, with `context_units`, `context_low`, `context_high`.
         param_names: what the d parameters are, with `param_units`, `param_low` and `param_high`.
         constraint: how the bounds are held: one of CONSTRAINTS.
         task: the name of the task, and the settings that it was learned with.
@@ -65,10 +66,10 @@ class SavedPolicy:
     coef: np.ndarray
     cov_chol: np.ndarray
     features: Features
-    context_name: str
-    context_unit: str
-    context_low: float
-    context_high: float
+    context_names: tuple[str, ...]
+    context_units: tuple[str, ...]
+    context_low: tuple[float, ...]
+    context_high: tuple[float, ...]
     param_names: tuple[str, ...]
     param_units: tuple[str, ...]
     param_low: tuple[float, ...]
@@ -85,30 +86,39 @@ class SavedPolicy:
         """Return the features of the context."""
         return self.features.make(self.context_low, self.context_high)
 
-    def mean(self, context: float) -> np.ndarray:
+    def mean(self, *context: float) -> np.ndarray:
         """Return the policy's mean (d,) as it was learned, before any bounds are applied.
 
+        Args:
+            context: a number for each context variable.
+
         Raises:
-            ValueError: if the context is outside the range that was learned.
+            UserError: if there are more or fewer, or one is outside the range that was learned.
         """
-        value = float(context)
-        # Ends that went through single precision belong to the range.
-        slack = 1e-6 * (self.context_high - self.context_low)
-        if not self.context_low - slack <= value <= self.context_high + slack:
-            raise UserError(
-                f"{self.context_name} must be within the learned range, {self.context_low:g} to "
-                f"{self.context_high:g} {self.context_unit}, got {context}"
-            )
-        features = self.feature_map().apply(jnp.array([value], jnp.float32))
+        if len(context) != len(self.context_names):
+            raise UserError(f"expected a number for each of {', '.join(self.context_names)}, got {context}")
+        for value, name, unit, low, high in zip(
+            context, self.context_names, self.context_units, self.context_low, self.context_high, strict=True
+        ):
+            # Ends that went through single precision belong to the range.
+            slack = 1e-6 * (high - low)
+            if not low - slack <= value <= high + slack:
+                raise UserError(
+                    f"{name} must be within the learned range, {low:g} to {high:g} {unit}, got {value}"
+                )
+        features = self.feature_map().apply(jnp.array(context, jnp.float32))
         return np.asarray(features) @ np.asarray(self.coef)
 
-    def theta(self, context: float) -> np.ndarray:
+    def theta(self, *context: float) -> np.ndarray:
         """Return the physical parameters (d,), within their bounds, for a context.
 
+        Args:
+            context: a number for each context variable.
+
         Raises:
-            ValueError: if the context is outside the range that was learned.
+            UserError: if there are more or fewer, or one is outside the range that was learned.
         """
-        mean = self.mean(context)
+        mean = self.mean(*context)
         low, high = (np.asarray(bound, np.float32) for bound in (self.param_low, self.param_high))
         if self.constraint == "sigmoid":
             return np.asarray(sigmoid_gate(jnp.asarray(mean), jnp.asarray(low), jnp.asarray(high)))
@@ -128,7 +138,8 @@ def save_policy(path: Path, saved: SavedPolicy) -> None:
         "coef": np.asarray(saved.coef, np.float32),
         "cov_chol": np.asarray(saved.cov_chol, np.float32),
         "features": json.dumps(dataclasses.asdict(saved.features)),
-        "context": json.dumps([saved.context_name, saved.context_unit]),
+        "context_names": np.array(saved.context_names),
+        "context_units": np.array(saved.context_units),
         "context_range": np.array([saved.context_low, saved.context_high]),
         "param_names": np.array(saved.param_names),
         "param_units": np.array(saved.param_units),
@@ -152,17 +163,16 @@ def load_policy(path: Path) -> SavedPolicy:
     if int(arrays.get("version", -1)) != VERSION:
         raise UserError(f"{path} is a policy file of version {arrays.get('version')}, expected {VERSION}")
     try:
-        context_name, context_unit = json.loads(str(arrays["context"]))
         context_low, context_high = arrays["context_range"].tolist()
         param_low, param_high = arrays["param_bounds"].tolist()
         saved = SavedPolicy(
             coef=arrays["coef"],
             cov_chol=arrays["cov_chol"],
             features=Features(**json.loads(str(arrays["features"]))),
-            context_name=context_name,
-            context_unit=context_unit,
-            context_low=context_low,
-            context_high=context_high,
+            context_names=tuple(arrays["context_names"].tolist()),
+            context_units=tuple(arrays["context_units"].tolist()),
+            context_low=tuple(context_low),
+            context_high=tuple(context_high),
             param_names=tuple(arrays["param_names"].tolist()),
             param_units=tuple(arrays["param_units"].tolist()),
             param_low=tuple(param_low),
@@ -191,6 +201,8 @@ def _check(path: Path, saved: SavedPolicy) -> None:
     numbers += [saved.context_low, saved.context_high]
     if not all(np.all(np.isfinite(values)) for values in numbers):
         raise UserError(f"{path}: the policy holds numbers that are not finite")
+    if not len(saved.context_names) == len(saved.context_units) == len(saved.context_low):
+        raise UserError(f"{path}: expected a unit and a range for each of {', '.join(saved.context_names)}")
     num_params = len(saved.param_names)
     wanted = (saved.feature_map().size, num_params)
     if np.shape(saved.coef) != wanted or np.shape(saved.cov_chol) != (num_params, num_params):

@@ -6,6 +6,7 @@
 #       extension: .py
 #       format_name: percent
 #       format_version: '1.3'
+#       jupytext_version: 1.19.6
 #   kernelspec:
 #     display_name: Python 3
 #     language: python
@@ -73,7 +74,7 @@ right.legend()
 from experiments.policy_file import load_policy
 
 policy = load_policy(ROOT / "models" / "nao" / "policies" / "walk.npz")
-print(f"{policy.context_name} from {policy.context_low} to {policy.context_high} {policy.context_unit}")
+print(policy.context_names, "from", policy.context_low, "to", policy.context_high, policy.context_units)
 for name, unit, slow, fast in zip(
     policy.param_names, policy.param_units, policy.theta(0.1), policy.theta(0.5), strict=True
 ):

@@ -14,10 +14,10 @@ def make_policy(**changes) -> SavedPolicy:
         coef=rng.normal(size=(4, 2)).astype(np.float32),
         cov_chol=np.eye(2, dtype=np.float32),
         features=Features("rbf", 4),
-        context_name="speed",
-        context_unit="m/s",
-        context_low=0.1,
-        context_high=0.6,
+        context_names=("speed",),
+        context_units=("m/s",),
+        context_low=(0.1,),
+        context_high=(0.6,),
         param_names=("a", "b"),
         param_units=("m", ""),
         param_low=(0.0, -1.0),
@@ -29,8 +29,8 @@ def make_policy(**changes) -> SavedPolicy:
 
 
 def rbf_mean(policy: SavedPolicy, context: float) -> np.ndarray:
-    centres = np.linspace(policy.context_low, policy.context_high, policy.features.num_centers)
-    width = (policy.context_high - policy.context_low) / policy.features.num_centers
+    centres = np.linspace(policy.context_low[0], policy.context_high[0], policy.features.num_centers)
+    width = (policy.context_high[0] - policy.context_low[0]) / policy.features.num_centers
     weights = np.exp(-((context - centres) ** 2) / (2 * width**2))
     return weights / weights.sum() @ policy.coef
 
@@ -66,6 +66,23 @@ def test_a_context_outside_the_learned_range_is_refused(context):
         make_policy().theta(context)
 
 
+def test_several_context_variables_each_have_a_range():
+    policy = make_policy(
+        context_names=("speed", "slope"),
+        context_units=("m/s", "deg"),
+        context_low=(0.1, -5.0),
+        context_high=(0.6, 5.0),
+        features=Features("linear"),
+        coef=np.array([[1.0, 0.0], [2.0, 0.0], [0.1, 1.0]]),
+        constraint="none",
+    )
+    np.testing.assert_allclose(policy.theta(0.5, -3.0), [1.7, -3.0], rtol=1e-6)
+    with pytest.raises(UserError, match=r"slope must be within the learned range, -5 to 5 deg, got 6"):
+        policy.theta(0.5, 6.0)
+    with pytest.raises(UserError, match=r"a number for each of speed, slope, got \(0\.5,\)"):
+        policy.theta(0.5)
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -76,7 +93,8 @@ def test_a_context_outside_the_learned_range_is_refused(context):
         {"param_units": ("m",)},
         {"constraint": "hope"},
         {"features": Features("cubic")},
-        {"context_high": float("nan")},
+        {"context_high": (float("nan"),)},
+        {"context_units": ()},
     ],
 )
 def test_what_is_no_policy_is_neither_saved_nor_loaded(tmp_path, changes, monkeypatch):
@@ -99,8 +117,8 @@ def test_foreign_files_and_other_versions_are_refused(tmp_path):
         load_policy(path)
     save_policy(path, make_policy())
     whole = results.load_arrays(path)
-    results.save_arrays(path, {**whole, "version": 2})
-    with pytest.raises(UserError, match="version 2, expected 1"):
+    results.save_arrays(path, {**whole, "version": 1})
+    with pytest.raises(UserError, match="version 1, expected 2"):
         load_policy(path)
     for name in whole.keys() - {"format", "version"}:
         results.save_arrays(path, {key: values for key, values in whole.items() if key != name})
