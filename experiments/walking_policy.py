@@ -1,6 +1,7 @@
 """Use a walking policy: record its walks, show one of them, film several side by side."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 
 from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
+from creps_jax.physics import c
 from creps_jax.tasks.nao_walk import CONTROL_PERIOD, record_walk
 from experiments import results
 from experiments.errors import UserError
@@ -69,9 +71,9 @@ def record(policy: SavedPolicy, speeds: Sequence[float], *, seed: int, duration:
     thetas = jnp.stack([jnp.asarray(policy.theta(speed)) for speed in speeds])
     keys = jax.random.split(jax.random.key(seed), len(speeds))
     balance = balance_of(policy)
-    walks = jax.jit(jax.vmap(lambda key, theta: record_walk(key, theta, duration=duration, balance=balance)))(
-        keys, thetas
-    )
+    # For a few walks, compiling MJX would take longer than they do.
+    walk = partial(record_walk, duration=duration, balance=balance, physics=c.make_control_step)
+    walks = jax.jit(jax.vmap(walk))(keys, thetas)
     qpos, fallen = np.asarray(walks.qpos), np.asarray(walks.has_fallen)
     clips = []
     for index, speed in enumerate(speeds):

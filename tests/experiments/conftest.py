@@ -43,6 +43,14 @@ def plot(arrays):
     return {"curve": plots.learning_curves({"tiny": {"samples": (episodes, arrays["reward"])}})}
 
 
+@pytest.fixture(autouse=True)
+def compiled_quickly():
+    """Compile in half the time what then runs slower: here experiments run for a few iterations."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture
 def tiny(tmp_path, monkeypatch):
     """Make the experiment known as `tiny`, and work in an empty folder."""

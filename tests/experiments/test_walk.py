@@ -11,6 +11,7 @@ import pytest
 
 from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
+from creps_jax.physics import c
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.nao_walk import WalkOutcome, nao_walk
 from creps_jax.train import evaluate
@@ -176,7 +177,7 @@ def test_the_shipped_policy_walks_at_the_asked_speed():
     policy = load_policy(policies_folder() / "walk.npz")
     speeds = jnp.array([[0.1], [0.25], [0.45], [0.6]])
     thetas = jnp.stack([jnp.asarray(policy.theta(float(speed))) for (speed,) in speeds])
-    task = nao_walk(duration=4.0, balance=balance_of(policy))
+    task = nao_walk(duration=4.0, balance=balance_of(policy), physics=c.make_control_step)
     outcome = evaluate(jax.random.key(0), task, speeds, thetas, repeats=4)
     assert not outcome.fell.any()
     np.testing.assert_allclose(outcome.speed[..., 0].mean(axis=1), speeds[:, 0], atol=0.05)
