@@ -31,9 +31,7 @@ def in_order(archive: Archive) -> Batch:
 
 # Each pair of sizes is compiled: few of them, but with batches below, at and above the archive's size.
 @settings(max_examples=50, deadline=None)
-@given(
-    archive_size=st.sampled_from([1, 4, 6]), batch_sizes=st.lists(st.sampled_from([1, 4, 9]), max_size=6)
-)
+@given(archive_size=st.sampled_from([1, 4, 6]), batch_sizes=st.lists(st.sampled_from([1, 4, 9]), max_size=6))
 def test_equals_a_bounded_deque(archive_size, batch_sizes):
     archive, oracle = empty_archive(archive_size, CONTEXT_DIM, THETA_DIM), deque(maxlen=archive_size)
     count = 0

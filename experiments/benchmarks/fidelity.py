@@ -1,0 +1,65 @@
+"""Walk with a policy in the physics it was learned in and in a finer one, side by side.
+
+    python -m experiments.benchmarks.fidelity [POLICY.npz]
+
+The finer one is C MuJoCo with a fifth of the time step and a solver that runs until it has converged. The
+seeds of the noise are used nowhere else. Without a file it is the shipped policy.
+"""
+
+from experiments.process import import_mjx_quietly, prepare
+
+prepare()
+import_mjx_quietly()
+
+import sys  # noqa: E402
+from pathlib import Path  # noqa: E402
+
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+
+from creps_jax.physics import c  # noqa: E402
+from creps_jax.tasks.nao_walk import load_nao, nao_walk  # noqa: E402
+from experiments import tables  # noqa: E402
+from experiments.benchmarks.policy import walk_at_all_speeds  # noqa: E402
+from experiments.errors import UserError  # noqa: E402
+from experiments.policy_file import policies_folder  # noqa: E402
+from experiments.walking_policy import balance_of, load_walking_policy  # noqa: E402
+
+SEED = 90_000
+FINER = 5
+ITERATIONS, LS_ITERATIONS = 100, 50
+
+
+def main(policy: tyro.conf.Positional[Path] = policies_folder() / "walk.npz") -> None:  # noqa: B008
+    """Measure a policy in both, and print speeds, falls and differences.
+
+    Args:
+        policy: Policy file; the shipped one by default.
+    """
+    saved = load_walking_policy(policy)
+    fine = load_nao()
+    fine.opt.timestep /= FINER
+    fine.opt.iterations, fine.opt.ls_iterations = ITERATIONS, LS_ITERATIONS
+    learned_in = nao_walk(balance=balance_of(saved))
+    finer = nao_walk(balance=balance_of(saved), model=fine, physics=c.make_control_step)
+    ours, other = (walk_at_all_speeds(saved, task, seed=SEED) for task in (learned_in, finer))
+    means = [outcome.speed.mean(axis=1) for outcome in (ours, other)]
+    columns = {
+        "asked m/s": [f"{speed:.2f}" for speed in tables.PAPER_SPEEDS],
+        "MJX": [f"{speed:.3f}" for speed in means[0][:, 0]],
+        "finer": [f"{speed:.3f}" for speed in means[1][:, 0]],
+        "difference": [f"{difference:+.3f}" for difference in (means[1] - means[0])[:, 0]],
+        "sideways, finer": [f"{speed:+.3f}" for speed in means[1][:, 1]],
+        "falls": [f"{a} and {b}" for a, b in zip(ours.fell.sum(axis=1), other.fell.sum(axis=1), strict=True)],
+    }
+    print(f"{ours.fell.shape[1]} walks a speed; finer: {1e3 * fine.opt.timestep:g} ms, Newton {ITERATIONS}\n")
+    print(tables.to_markdown(columns))
+    largest = np.abs(means[1] - means[0])[:, 0].max()
+    print(f"largest difference {largest:.3f} m/s, falls {ours.fell.sum()} and {other.fell.sum()}")
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main)
+    except UserError as error:
+        sys.exit(f"error: {error}")
