@@ -50,7 +50,7 @@ def main(
     outcome = walk_at_all_speeds(saved, nao_walk(balance=balance, noise=WalkNoise().times(noise)), seed=2026)
     print(
         tables.to_markdown(
-            tables.speed_table(tables.PAPER_SPEEDS, outcome.reward, outcome.speed, outcome.fell)
+            tables.speed_table(np.asarray(tables.PAPER_SPEEDS), outcome.reward, outcome.speed, outcome.fell)
         )
     )
     print(f"mean reward {outcome.reward.mean():.4f}, falls {int(outcome.fell.sum())} of {outcome.fell.size}")
