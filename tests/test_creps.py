@@ -11,7 +11,8 @@ from creps_jax.archive import Batch
 from creps_jax.creps import CrepsState, creps
 from creps_jax.dual import sample_weights
 from creps_jax.features import linear_features, quadratic_features, rbf_features
-from creps_jax.mstep import bounded_ml
+from creps_jax.importance import Importance
+from creps_jax.mstep import bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
 
 ARCHIVE_SIZE, NUM, THETA_DIM = 60, 40, 2
@@ -228,3 +229,39 @@ def test_refuses_contexts_that_are_not_finite(key, state):
 def test_refuses_batches_of_the_wrong_shape(state, shapes, message):
     with pytest.raises(ValueError, match=message):
         ALGORITHM.tell(state, Batch(*(jnp.zeros(shape) for shape in shapes)))
+
+
+@pytest.mark.parametrize(
+    ("m_step", "importance"),
+    [(weighted_ml, None), (bounded_ml(), Importance())],
+    ids=["the paper's", "bounded, importance weights"],
+)
+def test_a_search_does_not_know_the_units_of_parameters_and_contexts(m_step, importance):
+    """The same search, with parameters and the context in other units and from other zeros."""
+    unit, zero = np.float32([1e-3, 1.0, 200.0]), np.float32([1.0, -3.0, 50.0])
+    context_unit, context_zero = 0.1, 5.0
+    features = linear_features(1)
+    algorithm = creps(features, features, archive_size=120, m_step=m_step, importance=importance)
+    ask, tell = algorithm.ask, algorithm.tell
+
+    def search(convert_theta, convert_context, start):
+        state, best = algorithm.init(start), []
+        for iteration in range(12):
+            key = jax.random.fold_in(jax.random.key(0), iteration)
+            contexts = np.random.default_rng(iteration).uniform(0, 1, (40, 1)).astype(np.float32)
+            asked = ask(key, state, convert_context(contexts))
+            thetas = convert_theta(np.asarray(asked))
+            reward = -np.sum((thetas - np.float32([1.0, -1.0, 2.0]) * contexts) ** 2, axis=1)
+            state, _ = tell(state, Batch(jnp.asarray(convert_context(contexts)), asked, jnp.asarray(reward)))
+            best.append(reward.mean())
+        return np.array(best), thetas
+
+    plain = search(lambda x: x, lambda s: s, LinearGaussian(jnp.zeros((2, 3)), jnp.eye(3)))
+    other = search(
+        lambda x: (x - zero) / unit,
+        lambda s: context_unit * s + context_zero,
+        LinearGaussian(jnp.asarray([zero, 0 * zero]), jnp.diag(jnp.asarray(unit))),
+    )
+    assert plain[0][-1] > 0.05 * plain[0][0]
+    np.testing.assert_allclose(other[0], plain[0], rtol=0.02)
+    np.testing.assert_allclose(other[1], plain[1], atol=0.05 * plain[1].std())
