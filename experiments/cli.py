@@ -59,6 +59,7 @@ class Run:
         seed: Seed of all random numbers; 0 by default.
         out: Result folder; a new one in results/ by default.
         resume: Go on with the run in the folder --out, or with the latest unfinished one.
+        physics: What steps the robot: mjx, or c, which starts sooner (walk and fig11_walk only).
         speed: Learn nothing and show one walk at this speed in m/s (walk only).
         policy: Policy file for --speed; the latest learned or else the shipped one by default.
     """
@@ -70,6 +71,7 @@ class Run:
     seed: _Integer = None
     out: _File = None
     resume: bool = False
+    physics: _Text = None
     speed: _Number = None
     policy: _File = None
 
@@ -166,7 +168,7 @@ def _run(command: Run) -> int:
 
     from experiments import runner
 
-    asked = {"iterations": command.iterations, "trials": command.trials}
+    asked = {"iterations": command.iterations, "trials": command.trials, "physics": command.physics}
     request = runner.Request(
         name=command.name,
         preset=command.preset,
@@ -197,7 +199,7 @@ def _run_all(command: Run) -> int:
 def _show(command: Run, speed: float) -> int:
     if command.name != "walk":
         raise UserError(f"--speed goes with walk, not with {command.name}")
-    learning = {"preset": command.preset, "iterations": command.iterations, "trials": command.trials}
+    learning = {name: getattr(command, name) for name in ("preset", "iterations", "trials", "physics")}
     for name, value in {**learning, "resume": command.resume or None}.items():
         if value is not None:
             raise UserError(f"--{name} does not go with --speed, which learns nothing")

@@ -11,7 +11,7 @@ import pytest
 
 from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
-from creps_jax.physics import c
+from creps_jax.physics import c, mjx
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.nao_walk import WalkOutcome, nao_walk
 from creps_jax.train import evaluate
@@ -167,9 +167,20 @@ def test_settings_come_back_from_a_manifest():
     assert walk.Settings(**dataclasses.asdict(settings)) == settings
 
 
-def test_unknown_bounds_are_refused():
-    with pytest.raises(UserError, match="bounds must be one of nao, paper, got 'moon'"):
-        walk.Settings(bounds="moon")
+@pytest.mark.parametrize(("name", "known"), [("bounds", "nao, paper"), ("physics", "mjx, c")])
+def test_unknown_names_are_refused(name, known):
+    with pytest.raises(UserError, match=f"{name} must be one of {known}, got 'moon'"):
+        walk.Settings(**{name: "moon"})
+
+
+@pytest.mark.parametrize("name", walk.PHYSICS)
+def test_physics_is_what_is_asked_for(monkeypatch, name):
+    asked = {}
+    monkeypatch.setattr(
+        walk, "nao_walk", lambda *bounds, **settings: asked.update(settings) or stand_in(*bounds, **settings)
+    )
+    walk.make_task(walk.Settings(physics=name))
+    assert asked["physics"] is {"mjx": mjx, "c": c}[name].make_control_step
 
 
 @pytest.mark.usefixtures("relaxed_promotion")
