@@ -15,6 +15,7 @@ DESCRIPTIONS = {
     "fig06_reaching": "reach via-points with a planar arm (Fig. 6 and 7)",
     "fig08_hole": "reach into a hole with a planar arm (Fig. 8 and 9)",
     "fig11_walk": "ways to learn to walk: features, constraints, fits (Fig. 10, 11a and Table 2)",
+    "walk_inside": "what is planned and what the robot does, in a walk that stays up and in one that falls",
     "updates": "the paper's fit of the policy against the bounded one, on all tasks but walking",
 }
 """What each experiment shows; its module has the same name."""
