@@ -1,4 +1,4 @@
-"""Read the command line: `python -m experiments list | run NAME | plot NAME | check | video`.
+"""Read the command line: `python -m experiments list | run NAME | plot NAME | check | video | export`.
 
 Nothing heavy is imported before it is clear that it is needed: help and mistakes are answered at once.
 """
@@ -28,6 +28,7 @@ Learn, plot and check what the project can do.
   python -m experiments plot walk                 draw the figures of the latest results again
   python -m experiments check                     hold the latest results against the paper
   python -m experiments video                     film a policy at several speeds
+  python -m experiments export --to walk.h        write a policy (.onnx, .h) or a walk (.csv, .npz)
 
 Results go to results/. Add --help to any of these for all its options.
 """
@@ -39,6 +40,7 @@ _Names = Annotated[tuple[str, ...], arg(metavar="[NAME ...]", help_behavior_hint
 _Text = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 _Integer = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
 _Number = Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")]
+_Seconds = Annotated[float | None, arg(metavar="S", help_behavior_hint="")]
 _File = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="")]
 
 
@@ -117,12 +119,31 @@ class Video:
     seed: int = 0
 
 
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write a policy, or the joint set-points of one of its walks, for use elsewhere.
+
+    Attributes:
+        to: The file. The policy becomes an ONNX model (.onnx) or a C header (.h); a walk, played from
+            standstill and without posture feedback, becomes a table (.csv) or arrays (.npz).
+        policy: Policy file; the latest learned or else the shipped one of walking by default.
+        speed: Speed of the walk in m/s (.csv and .npz only).
+        duration: Length of the walk in s (.csv and .npz only); 8 by default.
+    """
+
+    to: Annotated[Path, arg(metavar="FILE")]
+    policy: _File = None
+    speed: _Number = None
+    duration: _Seconds = None
+
+
 Command = (
     Annotated[List, subcommand("list")]
     | Annotated[Run, subcommand("run")]
     | Annotated[Plot, subcommand("plot")]
     | Annotated[Check, subcommand("check")]
     | Annotated[Video, subcommand("video")]
+    | Annotated[Export, subcommand("export")]
 )
 
 
@@ -236,4 +257,11 @@ def _video(command: Video) -> int:
     return 0
 
 
-_HANDLERS = {List: _list, Run: _run, Plot: _plot, Check: _check, Video: _video}
+def _export(command: Export) -> int:
+    from experiments.export import export
+
+    export(command.to, command.policy, speed=command.speed, duration=command.duration, say=_say)
+    return 0
+
+
+_HANDLERS = {List: _list, Run: _run, Plot: _plot, Check: _check, Video: _video, Export: _export}

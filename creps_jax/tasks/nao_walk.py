@@ -10,10 +10,11 @@ import mujoco
 from jax import lax
 
 from creps_jax.contexts import gaussian_contexts
-from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, MAX_JOINT_SPEED, NUM_JOINTS
+from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, NUM_JOINTS
 from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints
-from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, params_from_theta
+from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, count_steps, params_from_theta
 from creps_jax.motion.walking.posture import Balance
+from creps_jax.motion.walking.set_points import next_set_point
 from creps_jax.physics import mjx
 from creps_jax.physics.state import ControlStep, RobotState, initial_state
 from creps_jax.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
@@ -26,8 +27,6 @@ CONTROL_PERIOD = 0.02
 # The torso centre stands .315 m high with the knees bent most; upright means within 50 degrees of it.
 _FALLEN_HEIGHT = 0.2
 _FALLEN_COSINE = 0.64
-# The shortest step the plan has to provide for, see `params_from_theta`.
-_SHORTEST_STEP = 0.08
 
 
 Physics = Callable[[mujoco.MjModel, int], ControlStep]
@@ -260,12 +259,11 @@ def _make_walker(model, duration, noise, balance, physics):
     _check_model(model)
     control_step = physics(model, round(CONTROL_PERIOD / model.opt.timestep))
     num_ticks = round(duration / CONTROL_PERIOD)
-    num_steps = round(duration / _SHORTEST_STEP) + 1
 
     def begin(key: PRNGKey, theta: Array) -> _Walk:
         start_key, lean_key, set_point_key = jax.random.split(key, 3)
         params = params_from_theta(theta)
-        plans = plan_walk(params, num_steps)
+        plans = plan_walk(params, count_steps(duration))
         first = pose_at(params, plans, jnp.zeros_like(params.lean))
         upright = jnp.stack([jnp.zeros_like(params.lean), params.lean, jnp.zeros_like(params.lean)])
         set_point = pose_joints(params, first, upright)
@@ -284,8 +282,7 @@ def _make_walker(model, duration, noise, balance, physics):
         pose, lean_noise = jax.tree.map(lambda leaf: leaf[tick], (walk.poses, walk.lean_noise))
         measured = quat_to_rpy(robot.qpos[3:7]) + lean_noise
         target = pose_joints(walk.params, pose, measured, balance=balance)
-        slew = MAX_JOINT_SPEED * CONTROL_PERIOD
-        target = set_point + jnp.clip(target - set_point, -slew, slew)
+        target = next_set_point(set_point, target, CONTROL_PERIOD)
         # The servos miss their set-points by the noise; the speed that they are told is the planned one.
         before = set_point + walk.set_point_noise[tick]
         after = target + walk.set_point_noise[tick + 1]

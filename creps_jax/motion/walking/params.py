@@ -15,6 +15,7 @@ __all__ = [
     "PARAM_NAMES",
     "PARAM_UNITS",
     "WalkParams",
+    "count_steps",
     "params_from_theta",
 ]
 
@@ -59,8 +60,9 @@ NAO_BOUNDS = (
     (0.01, 0.20, 0.06, 0.40, 5.0, 1.0, 1.0, 0.15, 0.1, 0.2),
 )
 
+_SHORTEST_STEP = 0.08
 # What the engine accepts, whatever theta says. Within it every plan is finite.
-_SAFE_LOW = (0.0, 0.10, 0.0, 0.08, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
+_SAFE_LOW = (0.0, 0.10, 0.0, _SHORTEST_STEP, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
 _SAFE_HIGH = (1.0, 0.22, 0.15, 4.0, 30.0, 2.0, 2.0, 0.2, 4.0, 10.0)
 # Amplitude at which the spring's acceleration would reach that of gravity is A = g T^2 / (4 pi^2): there
 # the ZMP equation is singular. Share of it that is allowed.
@@ -122,3 +124,12 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
         lean=params.lean * (math.pi / 180.0),
         double_support=jnp.minimum(params.double_support, _MAX_DOUBLE_SUPPORT_SHARE * duration),
     )
+
+
+def count_steps(duration: float) -> int:
+    """Return how many steps at most a walk can have, with any parameters of `params_from_theta`.
+
+    Args:
+        duration: Length of the walk, s.
+    """
+    return round(duration / _SHORTEST_STEP) + 1
