@@ -15,7 +15,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
 from experiments import registry
 from experiments.errors import UserError
-from experiments.process import import_mjx_quietly
+from experiments.process import import_mjx_quietly, join_processes
 
 OVERVIEW = """\
 Learn, plot and check what the project can do.
@@ -62,6 +62,8 @@ class Run:
         out: Result folder; a new one in results/ by default.
         resume: Go on with the run in the folder --out, or with the latest unfinished one.
         physics: What steps the robot: mjx, or c, which starts sooner (walk and fig11_walk only).
+        distributed: This is one of several processes, on one host or many, that share the run; see
+            docs/several_machines.md.
         speed: Learn nothing and show one walk at this speed in m/s (walk only).
         policy: Policy file for --speed; the latest learned or else the shipped one by default.
     """
@@ -74,6 +76,7 @@ class Run:
     out: _File = None
     resume: bool = False
     physics: _Text = None
+    distributed: bool = False
     speed: _Number = None
     policy: _File = None
 
@@ -184,6 +187,8 @@ def _run(command: Run) -> int:
         return _show(command, command.speed)
     if command.policy is not None:
         raise UserError("--policy goes with --speed")
+    if command.distributed:
+        join_processes()
     import_mjx_quietly()
     from rich.console import Console
 

@@ -272,7 +272,8 @@ def evaluate_trials(
     """Roll out the parameters (trials, n, d) of each trial; outcome with axes (trials, n, repeats)."""
     trials, num, _ = thetas.shape
     rows = jnp.tile(jnp.asarray(contexts)[:, None], (trials, 1))
-    outcome = evaluate(key, task, rows, jnp.asarray(thetas).reshape(trials * num, -1), repeats=repeats)
+    thetas = thetas.reshape(trials * num, -1)
+    outcome = evaluate(key, task, rows, jnp.asarray(thetas), repeats=repeats, devices=jax.devices())
     return jax.tree.map(lambda leaf: np.asarray(leaf).reshape(trials, num, *leaf.shape[1:]), outcome)
 
 
