@@ -32,6 +32,7 @@ from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
 __all__ = ["IterationLog", "evaluate", "make_iteration", "train", "train_trials"]
 
 OnIteration = Callable[[CrepsState, "IterationLog"], Any]
+"""Called as (state, log) after an iteration; what it returns is not used."""
 
 
 class IterationLog(NamedTuple):

@@ -39,7 +39,7 @@ def contextual_function(
         ValueError: If `transform` is not a matrix, or the range is not in order.
 
     Source: Abdolmaleki et al. 2017, Contextual covariance matrix adaptation evolutionary strategies,
-        Section 4.1.
+    Section 4.1.
     """
     if jnp.ndim(transform) != 2:
         raise ValueError(f"transform must have shape (d, s), got {jnp.shape(transform)}")

@@ -119,7 +119,7 @@ def hole_reaching(
         ValueError: If the range is not in order, or the hole is not one.
 
     Source: Abdolmaleki et al. 2016, Section 4.2; the weights 1e5 and 10, and the length of a step, are those
-        of its author's published settings.
+    of its author's published settings.
     """
     if not (width > 0.0 and depth > 0.0):
         raise ValueError(f"the hole must have a width and a depth, got {width} and {depth}")

@@ -20,8 +20,8 @@ __all__ = [
 ]
 
 GRAVITY = 9.81
+"""Acceleration of gravity, m/s^2."""
 
-# The paper's order (Table 1); the names are the fields of WalkParams.
 PARAM_NAMES = (
     "amplitude",
     "hip_height",
@@ -34,6 +34,8 @@ PARAM_NAMES = (
     "double_support",
     "step_growth",
 )
+"""Names of the parameters, the fields of `WalkParams`, in the paper's order (Table 1)."""
+
 PARAM_LABELS = (
     "A",
     "x0",
@@ -46,19 +48,23 @@ PARAM_LABELS = (
     "phi_DSP",
     "sigma_step",
 )
-PARAM_UNITS = ("m", "m", "m", "s", "deg", "", "", "m", "s", "m/s")
+"""The paper's symbols for the parameters."""
 
-# Section 4.3.1, as printed: (lower, upper).
+PARAM_UNITS = ("m", "m", "m", "s", "deg", "", "", "m", "s", "m/s")
+"""Units of the parameters in theta; gains have none."""
+
 PAPER_BOUNDS = (
     (0.0, 0.16, 0.02, 0.1, 0.0, 0.0, 0.0, 0.05, 0.0, 0.0),
     (1.0, 0.22, 0.15, 3.0, 5.0, 1.0, 1.0, 0.5, 1.0, 0.5),
 )
-# The part of that box in which a NAO can walk at all, with room for slow walking (step length from 0) and
-# leaning back.
+"""Lower and upper bounds of theta, as the paper prints them (Section 4.3.1)."""
+
 NAO_BOUNDS = (
     (0.0, 0.15, 0.02, 0.14, -5.0, 0.0, 0.0, 0.0, 0.0, 0.02),
     (0.01, 0.20, 0.06, 0.40, 5.0, 1.0, 1.0, 0.15, 0.1, 0.2),
 )
+"""Bounds in which a NAO can walk at all: part of `PAPER_BOUNDS`, with room for slow walking (step length from
+0) and leaning back."""
 
 _SHORTEST_STEP = 0.08
 # What the engine accepts, whatever theta says. Within it every plan is finite.
