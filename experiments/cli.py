@@ -1,4 +1,4 @@
-"""Read the command line: `python -m experiments list | run NAME | plot NAME | check | video`.
+"""Read the command line: `python -m experiments list | run NAME | plot NAME | check | video | session`.
 
 Nothing heavy is imported before it is clear that it is needed: help and mistakes are answered at once.
 """
@@ -16,6 +16,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 from experiments import registry
 from experiments.errors import UserError
 from experiments.process import import_mjx_quietly
+from experiments.session import commands
+from experiments.session.commands import SessionCommand
 
 OVERVIEW = """\
 Learn, plot and check what the project can do.
@@ -28,6 +30,7 @@ Learn, plot and check what the project can do.
   python -m experiments plot walk                 draw the figures of the latest results again
   python -m experiments check                     hold the latest results against the paper
   python -m experiments video                     film a policy at several speeds
+  python -m experiments session                   learn on a real robot, trial by trial
 
 Results go to results/. Add --help to any of these for all its options.
 """
@@ -121,6 +124,7 @@ Command = (
     | Annotated[Plot, subcommand("plot")]
     | Annotated[Check, subcommand("check")]
     | Annotated[Video, subcommand("video")]
+    | Annotated[SessionCommand, subcommand("session")]
 )
 
 
@@ -234,4 +238,16 @@ def _video(command: Video) -> int:
     return 0
 
 
-_HANDLERS = {List: _list, Run: _run, Plot: _plot, Check: _check, Video: _video}
+def _session(command: SessionCommand) -> int:
+    commands.run(command, say=_say)
+    return 0
+
+
+_HANDLERS = {
+    List: _list,
+    Run: _run,
+    Plot: _plot,
+    Check: _check,
+    Video: _video,
+    SessionCommand: _session,
+}

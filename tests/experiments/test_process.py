@@ -72,6 +72,13 @@ def test_a_home_that_cannot_be_written_costs_only_the_cache(tmp_path):
             "error: --trials does not go with --speed",
         ),
         (["run", "walk", "--policy", "x.npz"], 2, "", "error: --policy goes with --speed"),
+        (["session", "tell", "--help"], 0, "The measurement failed", ""),
+        (
+            ["session", "tell", "nowhere", "1", "--reward", "-2"],
+            2,
+            "",
+            "error: nowhere holds no robot session",
+        ),
     ],
 )
 def test_help_and_mistakes_are_answered_without_starting_jax(tmp_path, arguments, code, out, error):
