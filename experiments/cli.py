@@ -1,4 +1,4 @@
-"""Read the command line: `python -m experiments list | run NAME | plot NAME | check | video | export`.
+"""Read the command line, `python -m experiments list | run | plot | check | video | export | session`.
 
 Nothing heavy is imported before it is clear that it is needed: help and mistakes are answered at once.
 """
@@ -16,6 +16,8 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 from experiments import registry
 from experiments.errors import UserError
 from experiments.process import import_mjx_quietly, join_processes
+from experiments.session import commands
+from experiments.session.commands import SessionCommand
 
 OVERVIEW = """\
 Learn, plot and check what the project can do.
@@ -29,6 +31,7 @@ Learn, plot and check what the project can do.
   python -m experiments check                     hold the latest results against the paper
   python -m experiments video                     film a policy at several speeds
   python -m experiments export --to walk.h        write a policy (.onnx, .h) or a walk (.csv, .npz)
+  python -m experiments session                   learn on a real robot, trial by trial
 
 Results go to results/. Add --help to any of these for all its options.
 """
@@ -147,6 +150,7 @@ Command = (
     | Annotated[Check, subcommand("check")]
     | Annotated[Video, subcommand("video")]
     | Annotated[Export, subcommand("export")]
+    | Annotated[SessionCommand, subcommand("session")]
 )
 
 
@@ -269,4 +273,17 @@ def _export(command: Export) -> int:
     return 0
 
 
-_HANDLERS = {List: _list, Run: _run, Plot: _plot, Check: _check, Video: _video, Export: _export}
+def _session(command: SessionCommand) -> int:
+    commands.run(command, say=_say)
+    return 0
+
+
+_HANDLERS = {
+    List: _list,
+    Run: _run,
+    Plot: _plot,
+    Check: _check,
+    Video: _video,
+    Export: _export,
+    SessionCommand: _session,
+}

@@ -2,7 +2,7 @@
 
 import difflib
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
@@ -68,7 +68,7 @@ def check_name(name: str) -> None:
         UserError: with the nearest name, and all of them.
     """
     if name not in DESCRIPTIONS:
-        raise UserError(f"unknown experiment {name!r}{_suggest(name, DESCRIPTIONS)}")
+        raise UserError(f"unknown experiment {name!r}{suggest(name, DESCRIPTIONS)}")
 
 
 def load(name: str) -> Experiment:
@@ -88,11 +88,13 @@ def preset_settings(experiment: Experiment, preset: str) -> Any:
         UserError: if the experiment has none of that name.
     """
     if preset not in experiment.SETTINGS:
-        raise UserError(f"unknown preset {preset!r}{_suggest(preset, experiment.SETTINGS)}")
+        raise UserError(f"unknown preset {preset!r}{suggest(preset, experiment.SETTINGS)}")
     return experiment.SETTINGS[preset]
 
 
-def _suggest(name: str, known: Mapping[str, object]) -> str:
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Return how an error about an unknown name goes on: with the nearest one, and all of them."""
+    known = list(known)
     near = difflib.get_close_matches(name, known, n=1)
     hint = f", did you mean {near[0]!r}?" if near else ","
     return f"{hint} choose from: {', '.join(known)}"
