@@ -11,6 +11,7 @@ from experiments.errors import UserError
 
 DESCRIPTIONS = {
     "walk": "a NAO learns to walk at the speed you ask for (the main job)",
+    "walk_slope": "the same up and down slopes: a context of speed and slope, learned from the shipped walk",
     "fig05_sinus": "learn the sine of the context, with linear and with RBF features (Fig. 5)",
     "fig06_reaching": "reach via-points with a planar arm (Fig. 6 and 7)",
     "fig08_hole": "reach into a hole with a planar arm (Fig. 8 and 9)",
