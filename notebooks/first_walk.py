@@ -17,8 +17,8 @@
 # # First walk
 #
 # A simulated NAO that walks at the speed you ask for. The rule that it follows was learned: from the speed
-# to the ten numbers of a [walking engine](walking_engine.ipynb), by the search that [learned a
-# sine](first_policy.ipynb) in seconds.
+# to the ten numbers of a walking engine (notebook `walking_engine`), by the search that learned a sine in
+# seconds (`first_policy`).
 
 # %%
 import os
@@ -100,4 +100,4 @@ except VideoError as error:
 
 # %% [markdown]
 # Now learn one yourself: `python -m experiments run walk --preset quick`, in five to seven minutes. And for
-# a robot that is not this one, see [your own robot](your_own_robot.ipynb).
+# a robot that is not this one, see `your_own_robot`.
