@@ -62,7 +62,9 @@ def learn(features):
         if states.iteration[0] % 10 == 0:
             policies.append(states.policy.coef)
 
-    cj.train_trials(keys, task, algorithm, start, iterations=250, samples=50, on_iteration=keep)
+    # Movements as short as these are not worth sharing out.
+    run = {"iterations": 250, "samples": 50, "on_iteration": keep, "devices": jax.local_devices()[:1]}
+    cj.train_trials(keys, task, algorithm, start, **run)
     return np.stack(policies)
 
 
