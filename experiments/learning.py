@@ -170,7 +170,7 @@ class _Keeper:
 
     def take(self, state: CrepsState, log: Any) -> None:
         # One assignment: an interrupt finds the iteration either here whole or not at all.
-        row = {**named_leaves(log), "coef": np.asarray(state.policy.coef)}
+        row = {**named_leaves(log._replace(samples=None)), "coef": np.asarray(state.policy.coef)}
         self.latest = Checkpoint(state, append_log(self.latest.log, row))
         if time.monotonic() - self._saved_at >= _SECONDS_BETWEEN_CHECKPOINTS:
             self._write()
