@@ -138,7 +138,8 @@ class Progress:
         done = self._row.iteration if self._row else self._done
         view = View(self._title, self._iterations, done, self._cells(), tuple(self._rewards), self._recent)
         unicode = "utf" in (self._console.encoding or "").lower()
-        lines = draw(view, width, height - 1, unicode=unicode)
+        # A ^C that the terminal echoes behind the last line must not begin a new one.
+        lines = draw(view, max(width - len("^C"), 1), height - 1, unicode=unicode)
         self._drawn = width, [len(line) for line in lines]
         return Group(*lines)
 

@@ -10,6 +10,7 @@ from experiments.progress.by_context import Recent
 from experiments.progress.curve import draw_curve
 from experiments.progress.table import draw_table
 
+# Characters, lines, and a share of the width.
 _WIDEST = 110
 _HIGHEST_CURVE = 12
 _LOWEST_CURVE = 5
@@ -109,5 +110,6 @@ def _table(recent: Recent, width: int, rows: int, unicode: bool) -> list[Text]:
     lines = draw_table(groups, width, unicode=unicode)
     if not lines:
         return []
+    span = f"last {len(recent)} iterations" if len(recent) > 1 else "last iteration"
     what = "by context" if groups[0].speed is None else "speeds in m/s"
-    return [Text(f"last {len(recent)} iterations, {what}", style="dim"), *lines]
+    return [Text(f"{span}, {what}", style="dim"), *lines]

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.text import Text
 
 from experiments.progress import PooledSamples, Progress, Row, live
 from experiments.progress.by_context import Group, Recent
@@ -113,12 +114,20 @@ def test_a_resumed_run_shows_its_curve_at_once():
     assert "2/4" in text and "compiling" in text and "iteration" in text and "⠊" in text
 
 
+def test_an_echoed_interrupt_fits_behind_every_line():
+    out = console(terminal=True, width=80)
+    with Progress("title", 4, earlier=[-2.0, -1.0], console=out):
+        pass
+    lines = Text.from_ansi(out.file.getvalue()).plain.splitlines()
+    assert max(map(len, lines)) == 80 - len("^C")
+
+
 def test_what_a_narrower_terminal_has_wrapped_is_wiped():
     out = console(terminal=True, width=80)
     with Progress("title", 4, console=out):
         out.width = 30
     wipe = "\x1b[2K\x1b[1A"
-    # The bar of 80 characters has become three lines: two more than were drawn.
+    # The bar of 78 characters has become three lines: two more than were drawn.
     assert wipe * 2 in out.file.getvalue()
 
 
