@@ -96,18 +96,23 @@ def main(
         f"{usable_cores()} cores, {num_devices} devices ({platform}), episodes of {duration:g} s", flush=True
     )
     rows: dict[Case, Measured | str] = {}
-    for name, num in itertools.product(physics, devices):
-        for size in sorted(sizes):
-            print(f"{name}, devices {num}, batch {size} ...", file=sys.stderr, flush=True)
-            case = Case(name, num, size, duration)
-            try:
-                rows[case] = in_new_process(measure, case)
-            except BrokenProcessPool:
-                rows[case] = "killed"
-            if isinstance(rows[case], str):
-                break  # a larger batch would not fit either
-    print()
-    print(tables.to_markdown(columns(rows)))
+    try:
+        for name, num in itertools.product(physics, devices):
+            measure_sizes(rows, [Case(name, num, size, duration) for size in sorted(sizes)])
+    finally:  # an interrupt leaves what has been measured by then
+        print(f"\n{tables.to_markdown(columns(rows))}")
+
+
+def measure_sizes(rows: dict[Case, Measured | str], cases: Sequence[Case]) -> None:
+    """Measure cases of growing size, each in a new process, until one does not fit."""
+    for case in cases:
+        print(f"{case.physics}, devices {case.devices}, batch {case.size} ...", file=sys.stderr, flush=True)
+        try:
+            rows[case] = in_new_process(measure, case)
+        except BrokenProcessPool:
+            rows[case] = "killed"
+        if isinstance(rows[case], str):
+            return
 
 
 def check(

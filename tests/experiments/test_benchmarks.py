@@ -1,5 +1,7 @@
 """What the benchmarks print and refuse; they themselves measure for minutes."""
 
+import contextlib
+
 import pytest
 
 from experiments.benchmarks import scaling
@@ -54,22 +56,24 @@ def test_what_cannot_be_measured_is_refused(asked, message):
         scaling.check(**{**known, **asked})
 
 
-def test_a_process_that_dies_is_told_from_one_that_answers(monkeypatch):
-    answers = iter([("cpu", 1), IT, scaling.BrokenProcessPool("gone"), IT])
+@pytest.mark.parametrize("end", [scaling.BrokenProcessPool("gone"), KeyboardInterrupt()], ids=repr)
+def test_what_was_measured_is_printed_whatever_comes(monkeypatch, capsys, end):
+    answers = iter([("cpu", 1), IT, end, IT])
 
     def in_new_process(function, *arguments):
         answer = next(answers)
-        if isinstance(answer, Exception):
+        if isinstance(answer, BaseException):
             raise answer
         return answer
 
     monkeypatch.setattr(scaling, "in_new_process", in_new_process)
-    printed = []
-    monkeypatch.setattr("builtins.print", lambda *text, **_: printed.append(" ".join(map(str, text))))
-    scaling.main(sizes=(128, 32, 512), physics=("c",))
-    rows = [line.split("|")[3:5] for line in printed[-1].splitlines()[2:]]
+    is_interrupt = isinstance(end, KeyboardInterrupt)
+    with pytest.raises(KeyboardInterrupt) if is_interrupt else contextlib.nullcontext():
+        scaling.main(sizes=(128, 32, 512), physics=("c",))
+    lines = [line.split("|")[3:5] for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
     # After the batch that was too large no larger one is tried.
-    assert [[cell.strip() for cell in row] for row in rows] == [["32", "64"], ["128", "killed"]]
+    rows = [["32", "64"]] if is_interrupt else [["32", "64"], ["128", "killed"]]
+    assert [[cell.strip() for cell in line] for line in lines[2:]] == rows
 
 
 def test_the_largest_memory_is_in_mebibytes():
