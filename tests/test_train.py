@@ -59,6 +59,15 @@ class CountedTask:
 TASK = CountedTask().task
 
 
+@pytest.fixture(autouse=True, scope="module")
+def compiled_as_for_users():
+    """Compile with all optimisations: those that fuse operations are what could change bits."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 def run(key, *, task=TASK, algorithm=ALGORITHM, start=POLICY, iterations=ITERATIONS, **settings):
     settings = {"samples": SAMPLES, "first_samples": FIRST_SAMPLES, **settings}
     return train(key, task, algorithm, start, iterations=iterations, **settings)
