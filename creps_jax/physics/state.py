@@ -28,7 +28,8 @@ class RobotState(NamedTuple):
 ControlStep = Callable[..., RobotState]
 """(state, set-points before, set-points after, their speeds) -> state one control step later.
 
-A fifth argument, a `physics.world.World`, takes the place of the model's own world.
+A fifth argument, a `physics.world.World`, takes the place of the model's own world. A state of NaN, such as
+a batch has where a robot has fallen, gives any state.
 """
 
 

@@ -1,4 +1,4 @@
-"""Walk with a policy in the physics it was learned in and in a finer one, side by side.
+"""Walk with a policy by MJX and in a finer physics, side by side.
 
     python -m experiments.benchmarks.fidelity [POLICY.npz]
 

@@ -43,7 +43,7 @@ def draw_curve(rewards: Sequence[float], width: int, height: int, *, unicode: bo
         for row, text in enumerate(drawn)
     ]
     first, last = "1 ", f" {len(rewards):,}"
-    name = f"{' iteration ' if columns > 24 else '':{dash}^{columns - len(first + last)}}"
+    name = f"{' iteration ' if columns > 24 else '':{dash}^{max(columns - len(first + last), 0)}}"
     return [*lines, f"{'':{margin}} {corner}{first}{name}{last}"[:width]]
 
 
