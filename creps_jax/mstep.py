@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from creps_jax import checks
 from creps_jax.linalg import exact_dot, unbiased_normaliser
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
 from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
@@ -92,8 +93,7 @@ def bounded_ml(
     if entropy_loss_bound is not None:
         bounds["entropy_loss_bound"] = entropy_loss_bound
     for name, bound in bounds.items():
-        if not bound > 0:
-            raise ValueError(f"{name} must be positive, got {bound}")
+        checks.number(name, bound, above=0.0)
 
     def m_step(
         policy: LinearGaussian,

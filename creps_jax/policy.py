@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.linalg import exact_dot, safe_cholesky, unbiased_normaliser, weighted_ridge
 from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike
 
@@ -16,6 +17,8 @@ __all__ = ["LinearGaussian", "entropy", "fit_weighted_ml", "kl", "log_prob", "me
 _LOG_TWO_PI = 1.8378770664093453
 _ROUNDING = 3e-6
 """Spread of a feature, as a share of its size, that may be rounding."""
+_LARGEST = 1e15
+"""Size up to which products of two or three numbers are finite in float32."""
 
 
 class LinearGaussian(NamedTuple):
@@ -146,18 +149,28 @@ def fit_weighted_ml(
         definite for any weights: what too few samples leave open is filled in as small as rounding allows.
 
     Raises:
-        ValueError: If the numbers of samples differ.
+        ValueError: If shapes do not fit each other, or a number is out of its range.
 
     Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
     """
-    if features.shape[0] != theta.shape[0] or weights.shape != (theta.shape[0],):
+    features, theta = checks.array("features", features, ("n", "p")), checks.array("theta", theta, ("n", "d"))
+    weights = checks.finite("weights", checks.array("weights", weights, ("n",)), least=0.0)
+    if not len(features) == len(theta) == len(weights):
         raise ValueError(
             "fit_weighted_ml needs features (n, p), theta (n, d) and weights (n,), "
             f"got shapes {features.shape}, {theta.shape} and {weights.shape}"
         )
+    checks.number("ridge", ridge, least=0.0)
+    if scale is not None:
+        scale = checks.finite("scale", checks.array("scale", scale, features.shape[1:]), above=0.0)
+    if start is not None:
+        start = checks.array("start", start, (features.shape[1], theta.shape[1]))
+        checks.finite("start", start, largest=_LARGEST)
     is_weighted = weights > 0
     features = jnp.where(is_weighted[:, None], features, 0.0)
     theta = jnp.where(is_weighted[:, None], theta, 0.0)
+    checks.finite("features", features, largest=_LARGEST)
+    checks.finite("theta", theta, largest=_LARGEST)
     total = jnp.sum(weights)
     weights = weights / jnp.where(total > 0, total, 1.0)
 

@@ -14,7 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Key, UInt32
 
-from creps_jax.archive import Batch
+from creps_jax import checks
+from creps_jax.archive import Archive, Batch
 from creps_jax.creps import Creps, CrepsInfo, CrepsState
 from creps_jax.policy import LinearGaussian
 from creps_jax.rollouts import (
@@ -66,12 +67,17 @@ def make_iteration(
         the task.
 
     Raises:
-        ValueError: If `samples` is less than 1 or there are no devices.
+        ValueError: If an argument is no task, algorithm, positive whole number or devices.
 
     Source: Abdolmaleki et al. 2016, Algorithm 1.
     """
     setup = _make_setup(task, algorithm, samples, devices)
-    return lambda key, state: _iterate(setup, key, replicate(state, setup.devices))
+
+    def iteration(key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
+        checks.key("key", key)
+        return _iterate(setup, key, replicate(_checked_state("state", state), setup.devices))
+
+    return iteration
 
 
 def train(
@@ -104,9 +110,12 @@ def train(
         The last state, and the logs stacked along a first axis of `iterations`.
 
     Raises:
-        ValueError: If a number is less than 1, or the state does not fit task or features.
+        ValueError: If an argument is none of what is asked for here, or state, task and features do not fit
+            each other.
     """
-    state = start if isinstance(start, CrepsState) else algorithm.init(start)
+    checks.key("key", key)
+    _check_run(task, algorithm, start, on_iteration)
+    state = _checked_start(start) if isinstance(start, CrepsState) else algorithm.init(start)
     phases = _phases(task, algorithm, state, iterations, samples, first_samples, devices)
     state = replicate(state, phases[0][0].devices)
     state, logs = _run(_iterate, phases, key, state, on_iteration)
@@ -147,14 +156,17 @@ def train_trials(
     Raises:
         ValueError: As in `train`, and if there is not one state for each key.
     """
-    num_trials = keys.shape[0]
+    num_trials = checks.number_of_keys("keys", keys)
+    _check_run(task, algorithm, start, on_iteration)
     if isinstance(start, CrepsState):
-        states = start
+        states = _checked_start(start)
     else:
         first = algorithm.init(start)
         states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_trials, *x.shape)), first)
-    if states.iteration.shape != (num_trials,):
-        raise ValueError(f"one state is needed for each of {num_trials} keys, got {states.iteration.shape}")
+    if jnp.shape(states.iteration) != (num_trials,):
+        raise ValueError(
+            f"start must have one state for each of {num_trials} keys, got {jnp.shape(states.iteration)}"
+        )
     phases = _phases(task, algorithm, states, iterations, samples, first_samples, devices)
     setup = phases[0][0]
     place = spread_rows if _shares_trials(setup, num_trials) else replicate
@@ -189,9 +201,11 @@ def evaluate(
     Raises:
         ValueError: If a shape does not fit the task, or `repeats` is less than 1.
     """
-    if repeats < 1:
-        raise ValueError(f"repeats must be at least 1, got {repeats}")
-    num = contexts.shape[0]
+    checks.key("key", key)
+    checks.instance("task", task, Task)
+    repeats = checks.count("repeats", repeats)
+    contexts, thetas = checks.array("contexts", contexts), checks.array("thetas", thetas)
+    num = contexts.shape[0] if contexts.ndim else 0
     if contexts.shape != (num, task.context_dim) or thetas.shape != (num, task.theta_dim) or num == 0:
         raise ValueError(
             f"the task takes contexts (n, {task.context_dim}) and thetas (n, {task.theta_dim}), "
@@ -212,9 +226,9 @@ class _Setup(NamedTuple):
 
 
 def _make_setup(task: Task, algorithm: Creps, samples: int, devices: Devices) -> _Setup:
-    if samples < 1:
-        raise ValueError(f"samples must be at least 1, got {samples}")
-    return _Setup(task, algorithm, samples, device_tuple(devices))
+    checks.instance("task", task, Task)
+    checks.instance("algorithm", algorithm, Creps)
+    return _Setup(task, algorithm, checks.count("samples", samples), device_tuple(devices))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -225,9 +239,7 @@ def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState
     # differently in a scan and on its own.
     key, state = lax.optimization_barrier((key, state))
     context_key, theta_key, rollout_key = jax.random.split(jax.random.fold_in(key, state.iteration), 3)
-    contexts = jax.vmap(task.sample_context)(jax.random.split(context_key, samples))
-    if contexts.shape != (samples, task.context_dim):
-        raise ValueError(f"sample_context must give ({task.context_dim},), got {contexts.shape[1:]}")
+    contexts = jax.vmap(partial(_sample_context, task))(jax.random.split(context_key, samples))
     thetas = algorithm.ask(theta_key, state, contexts)
     outcomes, is_failed = roll_out(task, devices, rollout_key, contexts, thetas)
     state, info = algorithm.tell(state, Batch(contexts, thetas, outcomes.reward))
@@ -246,6 +258,10 @@ def _iterate_trials(setup: _Setup, keys: Array, states: CrepsState) -> tuple[Cre
         return jax.vmap(partial(_iterate, setup))(keys, states)
     alone = setup._replace(devices=setup.devices[:1])
     return share_rows(jax.vmap(partial(_iterate, alone)), setup.devices)(keys, states)
+
+
+def _sample_context(task: Task, key: PRNGKey) -> Array:
+    return checks.array("what sample_context gives", task.sample_context(key), (task.context_dim,))
 
 
 def _shares_trials(setup: _Setup, num_trials: int) -> bool:
@@ -268,14 +284,13 @@ def _phases(
     devices: Devices,
 ) -> list[tuple[_Setup, int]]:
     """List with how many samples to run how many iterations."""
-    if iterations < 1:
-        raise ValueError(f"iterations must be at least 1, got {iterations}")
+    iterations = checks.count("iterations", iterations)
     ordinary = _make_setup(task, algorithm, samples, devices)
     is_begun = np.any(np.asarray(state.iteration) > 0)
+    if first_samples is not None:
+        first_samples = checks.count("first_samples", first_samples)
     if first_samples is None or is_begun:
         return [(ordinary, iterations)]
-    if first_samples < 1:
-        raise ValueError(f"first_samples must be at least 1, got {first_samples}")
     phases = [(ordinary._replace(samples=first_samples), 1), (ordinary, iterations - 1)]
     return [(setup, length) for setup, length in phases if length > 0]
 
@@ -302,11 +317,38 @@ def _run(
     return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
 
 
+def _check_run(task: Task, algorithm: Creps, start: Any, on_iteration: OnIteration | None) -> None:
+    checks.instance("task", task, Task)
+    checks.instance("algorithm", algorithm, Creps)
+    checks.instance("start", start, LinearGaussian, CrepsState)
+    if on_iteration is not None:
+        checks.function("on_iteration", on_iteration, "(state, log)")
+
+
+def _checked_state(name: str, state: CrepsState) -> CrepsState:
+    """Return a state, its policy as arrays; whether it is of the algorithm, `ask` and `tell` will see."""
+    checks.instance(name, state, CrepsState)
+    checks.instance(f"{name}.policy", state.policy, LinearGaussian)
+    checks.instance(f"{name}.archive", state.archive, Archive)
+    fields = {field: checks.array(f"{name}.policy.{field}", x) for field, x in state.policy._asdict().items()}
+    return state._replace(policy=LinearGaussian(**fields))
+
+
+def _checked_start(start: CrepsState) -> CrepsState:
+    start = _checked_state("start", start)
+    for field, values in start.policy._asdict().items():
+        checks.finite(f"start.policy.{field}", values)
+    return start
+
+
 def _check_fit(task: Task, state: CrepsState) -> None:
-    theta_dim, context_dim = state.policy.coef.shape[1], state.archive.batch.context.shape[1]
-    if theta_dim != task.theta_dim:
-        raise ValueError(f"the policy gives {theta_dim} parameters, the task takes {task.theta_dim}")
-    if context_dim != task.context_dim:
+    coef, context = state.policy.coef, state.archive.batch.context
+    if coef.shape[-1:] != (task.theta_dim,):
         raise ValueError(
-            f"the features take {context_dim} context variables, the task has {task.context_dim}"
+            f"the policy must give the task's {task.theta_dim} parameters, got coef of shape {coef.shape}"
+        )
+    if context.shape[-1:] != (task.context_dim,):
+        raise ValueError(
+            f"the features must take the task's {task.context_dim} context variables, "
+            f"got an archive of shape {context.shape}"
         )

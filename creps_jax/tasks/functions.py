@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.contexts import uniform_contexts
 from creps_jax.tasks.base import PlainOutcome, Task
 from creps_jax.typing import Array, Float, PRNGKey, Scalar
@@ -36,18 +37,24 @@ def contextual_function(
         The task, with uniform contexts; it has no noise.
 
     Raises:
-        ValueError: If `transform` is not a matrix, or the range is not in order.
+        ValueError: If `transform` is no finite matrix, or the range is not in order.
 
     Source: Abdolmaleki et al. 2017, Contextual covariance matrix adaptation evolutionary strategies,
         Section 4.1.
     """
-    if jnp.ndim(transform) != 2:
-        raise ValueError(f"transform must have shape (d, s), got {jnp.shape(transform)}")
-    theta_dim, context_dim = jnp.shape(transform)
+    checks.function("function", function, "(x) -> number")
+    checks.number("low", low)
+    checks.number("high", high)
+    matrix = checks.finite("transform", checks.array("transform", transform, ("d", "s")))
+    theta_dim, context_dim = matrix.shape
 
     def rollout(key: PRNGKey, context: Float[Array, " s"], theta: Float[Array, " d"]) -> PlainOutcome:
         del key
-        moved = theta + jnp.sum(jnp.asarray(transform, theta.dtype) * context[None], axis=1)
+        context, theta = (
+            checks.array("context", context, (context_dim,)),
+            checks.array("theta", theta, (theta_dim,)),
+        )
+        moved = theta + jnp.sum(jnp.asarray(matrix, theta.dtype) * context[None], axis=1)
         return PlainOutcome(-function(moved), jnp.zeros(0, theta.dtype))
 
     sample_context = uniform_contexts((low,) * context_dim, (high,) * context_dim)

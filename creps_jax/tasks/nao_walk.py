@@ -1,5 +1,6 @@
 """The walking task: a simulated NAO walks straight ahead, from standstill, at the speed it is asked for."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 from jax import lax
 
+from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, MAX_JOINT_SPEED, NUM_JOINTS
 from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints
@@ -26,6 +28,8 @@ CONTROL_PERIOD = 0.02
 # The torso centre stands .315 m high with the knees bent most; upright means within 50 degrees of it.
 _FALLEN_HEIGHT = 0.2
 _FALLEN_COSINE = 0.64
+# All control steps are planned before the first: a longer episode would fill the memory.
+_LONGEST = 3600.0
 # The shortest step the plan has to provide for, see `params_from_theta`.
 _SHORTEST_STEP = 0.08
 
@@ -176,8 +180,13 @@ def nao_walk(
 
     Source: Abdolmaleki et al. 2016, Section 4.3.
     """
+    _check_settings(reward, noise, balance, physics)
+    for name, value in (("low", low), ("high", high), ("duration", duration), ("start_up", start_up)):
+        checks.number(name, value)
     if not low < high:
         raise ValueError(f"low must be below high, got {low} and {high}")
+    if duration > _LONGEST:
+        raise ValueError(f"duration must be at most {_LONGEST:g} s, got {duration}")
     if not 0 <= start_up < duration:
         raise ValueError(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
@@ -308,8 +317,21 @@ def _has_fallen(qpos: Array) -> Array:
     return ~stands
 
 
+def _check_settings(reward: WalkReward, noise: WalkNoise, balance: Balance, physics: Physics) -> None:
+    for name, record, kind, least in (
+        ("reward", reward, WalkReward, -math.inf),
+        ("noise", noise, WalkNoise, 0.0),
+        ("balance", balance, Balance, -math.inf),
+    ):
+        checks.instance(name, record, kind)
+        for field, value in record._asdict().items():
+            checks.number(f"{name}.{field}", value, least=least)
+    checks.function("physics", physics, "(model, number of steps) -> control step")
+
+
 def _check_model(model: mujoco.MjModel) -> None:
     """Refuse a model with other actuators, or with a time step that does not divide a control step."""
+    checks.instance("model", model, mujoco.MjModel)
     names = tuple(model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu))
     if names != JOINT_NAMES:
         raise ValueError(f"the model's actuators must drive {JOINT_NAMES} in this order, got {names}")

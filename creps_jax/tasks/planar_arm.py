@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.motion.dmp import DmpTrajectory, dmp_trajectory
 from creps_jax.tasks.base import PlainOutcome, Task
@@ -70,15 +71,19 @@ def via_point_reaching(
         The task; it has no noise.
 
     Raises:
-        ValueError: If the range is not in order.
+        ValueError: If the range is not in order, or not of two variables.
 
     Source: Abdolmaleki et al. 2016, Section 4.2; the end point (5, 0) in print is out of reach.
     """
+    if checks.vector("low", low).shape != (2,):
+        raise ValueError(f"low must have two entries, of x and y, got {checks.shown(low)}")
     default = gaussian_contexts(low, high, clip=True)
     sample_context = default if sample_context is None else sample_context
+    theta_dim = NUM_BASIS * NUM_LINKS
 
     def rollout(key: PRNGKey, context: Float[Array, "2"], theta: Float[Array, "15"]) -> PlainOutcome:
         del key
+        context, theta = checks.array("context", context, (2,)), checks.array("theta", theta, (theta_dim,))
         movement = via_point_movement(theta)
         tips = jax.vmap(arm_points)(movement.pos)[:, -1]
         miss = jnp.sum(jnp.square(tips[_VIA_STEP - 1] - context))
@@ -86,7 +91,7 @@ def via_point_reaching(
         reward = -1e4 * miss - 0.5 * jnp.sum(jnp.square(movement.acc))
         return PlainOutcome(reward, jnp.zeros(0, theta.dtype))
 
-    return Task(sample_context, rollout, context_dim=2, theta_dim=NUM_BASIS * NUM_LINKS, worst_reward=-1e7)
+    return Task(sample_context, rollout, context_dim=2, theta_dim=theta_dim, worst_reward=-1e7)
 
 
 def hole_reaching(
@@ -121,13 +126,17 @@ def hole_reaching(
     Source: Abdolmaleki et al. 2016, Section 4.2; the weights 1e5 and 10, and the length of a step, are those
         of its author's published settings.
     """
-    if not (width > 0.0 and depth > 0.0):
-        raise ValueError(f"the hole must have a width and a depth, got {width} and {depth}")
+    checks.number("low", low)
+    checks.number("high", high)
+    checks.number("width", width, above=0.0)
+    checks.number("depth", depth, above=0.0)
     default = gaussian_contexts(low, high, clip=True)
     sample_context = default if sample_context is None else sample_context
+    theta_dim = (NUM_BASIS + 1) * NUM_LINKS
 
     def rollout(key: PRNGKey, context: Float[Array, "1"], theta: Float[Array, "18"]) -> HoleOutcome:
         del key
+        context, theta = checks.array("context", context, (1,)), checks.array("theta", theta, (theta_dim,))
         movement = hole_movement(theta)
         points = jax.vmap(arm_points)(movement.pos)
         hits = jax.vmap(lambda posture: hits_ground(posture, context[0], width, depth))(points)
@@ -139,7 +148,6 @@ def hole_reaching(
         reward = -1e5 * (missed + num_collisions) - 10.0 * jnp.sum(jnp.square(movement.acc))
         return HoleOutcome(reward, jnp.zeros(0, theta.dtype), num_collisions, jnp.sqrt(last))
 
-    theta_dim = (NUM_BASIS + 1) * NUM_LINKS
     return Task(sample_context, rollout, context_dim=1, theta_dim=theta_dim, worst_reward=-1e8)
 
 

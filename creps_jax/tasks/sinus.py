@@ -4,6 +4,7 @@ import math
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.tasks.base import PlainOutcome, Task
 from creps_jax.typing import Array, Float, PRNGKey
@@ -26,13 +27,16 @@ def sinus(low: float = 0.0, high: float = 5 * math.pi) -> Task:
         A task of one context, Gaussian over the range, and one parameter.
 
     Raises:
-        ValueError: If `low` is not below `high`.
+        ValueError: If `low` is not below `high`, or one of them is no number.
 
     Source: Abdolmaleki et al. 2016, Section 4.1 and Fig. 5 (the reward is printed without its minus).
     """
+    checks.number("low", low)
+    checks.number("high", high)
 
     def rollout(key: PRNGKey, context: Float[Array, " 1"], theta: Float[Array, " 1"]) -> PlainOutcome:
         del key  # The task has no noise.
+        context, theta = checks.array("context", context, (1,)), checks.array("theta", theta, (1,))
         reward = -jnp.square(theta[0] - jnp.sin(context[0]))
         return PlainOutcome(reward=reward, violation=jnp.zeros(0))
 

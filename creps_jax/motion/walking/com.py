@@ -4,6 +4,7 @@ import math
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.linalg import thomas_solve
 from creps_jax.motion.walking.params import GRAVITY
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
@@ -52,7 +53,7 @@ def com_trajectory(
 
     Args:
         zmp: ZMP reference along one horizontal axis, m. Its two end values are not used.
-        com_height: CoM height above the floor, m.
+        com_height: CoM height above the floor, m; positive.
         com_height_acc: Vertical CoM acceleration, m/s^2; greater than -g everywhere.
         start: CoM position at the first node, m.
         end: CoM position at the last node, m.
@@ -62,18 +63,30 @@ def com_trajectory(
         CoM position at the nodes, m.
 
     Raises:
-        ValueError: If there are fewer than three nodes or the shapes differ.
+        ValueError: If there are fewer than three nodes or the shapes differ, or a number is out of its range.
 
     Source: Abdolmaleki et al. 2016, Eq. 1, 5-9, with the signs of Eq. 1.
     """
+    zmp = checks.array("zmp", zmp)
+    com_height = checks.array("com_height", com_height)
+    com_height_acc = checks.array("com_height_acc", com_height_acc)
     shapes = [zmp.shape, com_height.shape, com_height_acc.shape]
-    if len(set(shapes)) != 1 or zmp.shape[0] < 3:
-        raise ValueError(f"com_trajectory needs three vectors of the same length n >= 3, got shapes {shapes}")
+    if len(set(shapes)) != 1 or zmp.ndim != 1 or zmp.shape[0] < 3:
+        raise ValueError(
+            "com_trajectory needs zmp, com_height and com_height_acc to be vectors of one length n >= 3, "
+            f"got shapes {shapes}"
+        )
+    checks.finite("com_height", com_height, above=0.0)
+    checks.finite("com_height_acc", com_height_acc, above=-GRAVITY)
+    checks.number("start", start)
+    checks.number("end", end)
+    checks.number("duration", duration, above=0.0)
     weight = _neighbour_weight(com_height, com_height_acc, duration)
     # First and last row say x(1) = start and x(n) = end.
     inner = jnp.ones_like(zmp).at[jnp.array([0, -1])].set(0.0)
     neighbour = weight * inner
     rhs = zmp.at[0].set(start).at[-1].set(end)
+    checks.finite("zmp", rhs)
     return thomas_solve(neighbour, 1.0 - 2.0 * neighbour, neighbour, rhs)
 
 

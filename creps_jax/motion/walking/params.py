@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float, Scalar
 
 __all__ = [
@@ -112,7 +113,11 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
 
     Returns:
         The settings, in SI units.
+
+    Raises:
+        ValueError: If theta has not one entry for each parameter.
     """
+    theta = checks.array("theta", theta, (len(PARAM_NAMES),))
     safe = jnp.clip(theta, jnp.asarray(_SAFE_LOW, theta.dtype), jnp.asarray(_SAFE_HIGH, theta.dtype))
     params = WalkParams(*safe)
     duration = params.step_duration
