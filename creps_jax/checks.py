@@ -16,6 +16,7 @@ from jax.core import Tracer
 from creps_jax.typing import Array
 
 __all__ = [
+    "LARGEST",
     "array",
     "count",
     "ends",
@@ -30,11 +31,13 @@ __all__ = [
     "vector",
 ]
 
+LARGEST = 1e15
+"""Size of numbers up to which products of two of them, and sums of those, are finite in float32."""
 _MOST = 2**31 - 1
 """The largest count: indices have 32 bits."""
 _MOST_POINTS = 10_000_000
 """The largest grid: its size is a power, and a slip would fill the memory."""
-_LARGEST = float(np.finfo(np.float32).max)
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
 _WIDTH = 80
 """Characters of a value that errors show."""
 
@@ -84,14 +87,14 @@ def number(name: str, value: Any, *, least: float = -math.inf, above: float = -m
         ValueError: If it is not.
     """
     if not _is_number(value):
-        raise ValueError(f"{name} must be a finite number{_limits(least, above)}, got {shown(value)}")
+        raise ValueError(f"{name} must be a number, got {shown(value)}")
     if isinstance(value, Tracer):
         return value
     value = value.item() if isinstance(value, np.ndarray | jax.Array) else value
-    rounded = np.float32(value) if -_LARGEST <= value <= _LARGEST else np.float32(np.nan)
+    rounded = np.float32(value) if -_FLOAT32_MAX <= value <= _FLOAT32_MAX else np.float32(np.nan)
     if not (rounded >= least and rounded > above):
         note = ", which float32 cannot hold" if max(least, above) < value < math.inf else ""
-        raise ValueError(f"{name} must be a finite number{_limits(least, above)}, got {shown(value)}{note}")
+        raise ValueError(f"{name} must be {_limits(least, above)}, got {shown(value)}{note}")
     return value
 
 
@@ -107,9 +110,10 @@ def vector(name: str, value: Any, *, may_be_infinite: bool = False) -> np.ndarra
         values = np.asarray(None)
     if values.dtype.kind not in "iuf" or values.ndim > 1 or values.size == 0:
         raise ValueError(f"{name} must be a number or a vector of numbers, got {shown(value)}")
-    is_good = (np.abs(values) <= _LARGEST) | (np.isinf(values) if may_be_infinite else False)
+    is_good = (np.abs(values) <= _FLOAT32_MAX) | (np.isinf(values) if may_be_infinite else False)
     if not is_good.all():
-        raise ValueError(f"{name} must be finite numbers, got {values[~is_good][0]}")
+        wanted = "numbers" if may_be_infinite else "finite"
+        raise ValueError(f"{name} must be {wanted}, got {values[~is_good][0]}")
     return values.astype(float)
 
 
@@ -181,10 +185,7 @@ def finite(
         is_good = np.isfinite(known) if largest is None else np.abs(known) <= largest
         is_good &= (known >= least) & ((known > above) | (above == -math.inf))
         if not is_good.all():
-            limit = (
-                _limits(least, above) if largest in (None, math.inf) else f" of at most {largest:g} in size"
-            )
-            raise ValueError(f"{name} must be finite numbers{limit}, got {known[~is_good][0]}")
+            raise ValueError(f"{name} must be {_limits(least, above, largest)}, got {known[~is_good][0]}")
     return values
 
 
@@ -234,10 +235,12 @@ def instance(name: str, value: Any, *kinds: type) -> None:
         raise ValueError(f"{name} must be of type {wanted}, got {shown(value)}")
 
 
-def _limits(least: float, above: float) -> str:
+def _limits(least: float, above: float, largest: float | None = None) -> str:
+    if largest is not None:
+        return "numbers" if largest == math.inf else f"numbers of at most {largest:g} in size"
     if above > least:
-        return f" above {above:g}"
-    return f" of at least {least:g}" if least > -math.inf else ""
+        return f"finite and above {above:g}"
+    return f"finite and at least {least:g}" if least > -math.inf else "finite"
 
 
 def _is_number(value: Any) -> bool:

@@ -141,6 +141,8 @@ def creps(
 
     def init(policy: LinearGaussian) -> CrepsState:
         policy = _checked_policy("policy", policy, policy_features)
+        for field, values in policy._asdict().items():
+            checks.finite(f"policy.{field}", values, largest=checks.LARGEST)
         theta_dim = policy.coef.shape[1]
         least = policy_features.size + theta_dim
         if archive_size < least:

@@ -159,7 +159,7 @@ def sample_weights(
     Source: Abdolmaleki et al. 2016, the solution p(s, theta) below Eq. 12.
     """
     reward, features, prior = _checked_samples(reward, features, valid)
-    _check_solution(solution, features)
+    solution = _checked_solution(solution, features)
     is_counted = _is_counted(reward, features, prior)
     reward, features, prior = _mask(reward, features, prior)
     shifted, centred = _shift(reward, prior), centre_columns(features, prior)
@@ -382,8 +382,8 @@ def _checked_samples(reward: Array, features: Array, valid: Array | None) -> tup
     return reward, features, checks.array("valid", valid, reward.shape).astype(reward.dtype)
 
 
-def _check_solution(solution: DualSolution, features: Array) -> None:
+def _checked_solution(solution: DualSolution, features: Array) -> DualSolution:
     checks.instance("solution", solution, DualSolution)
     checks.number("solution.temperature", solution.temperature, above=0.0)
     coef = checks.array("solution.baseline_coef", solution.baseline_coef, features.shape[1:])
-    checks.finite("solution.baseline_coef", coef)
+    return solution._replace(baseline_coef=checks.finite("solution.baseline_coef", coef))

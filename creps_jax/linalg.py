@@ -87,7 +87,7 @@ def thomas_solve(
     zero = jnp.zeros_like(rhs[0])
     _, reduced = lax.scan(eliminate, (zero, zero), (lower, diag, upper, rhs))
     _, solution = lax.scan(substitute, zero, reduced, reverse=True)
-    return checks.finite("the solution, for which no pivot of lower, diag and upper may be zero,", solution)
+    return checks.finite("the solution, for which lower, diag and upper have to leave all pivots,", solution)
 
 
 def weighted_ridge(

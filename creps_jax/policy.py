@@ -17,8 +17,6 @@ __all__ = ["LinearGaussian", "entropy", "fit_weighted_ml", "kl", "log_prob", "me
 _LOG_TWO_PI = 1.8378770664093453
 _ROUNDING = 3e-6
 """Spread of a feature, as a share of its size, that may be rounding."""
-_LARGEST = 1e15
-"""Size up to which products of two or three numbers are finite in float32."""
 
 
 class LinearGaussian(NamedTuple):
@@ -163,14 +161,15 @@ def fit_weighted_ml(
     checks.number("ridge", ridge, least=0.0)
     if scale is not None:
         scale = checks.finite("scale", checks.array("scale", scale, features.shape[1:]), above=0.0)
+        checks.finite("scale", scale, largest=checks.LARGEST)
     if start is not None:
         start = checks.array("start", start, (features.shape[1], theta.shape[1]))
-        checks.finite("start", start, largest=_LARGEST)
+        checks.finite("start", start, largest=checks.LARGEST)
     is_weighted = weights > 0
     features = jnp.where(is_weighted[:, None], features, 0.0)
     theta = jnp.where(is_weighted[:, None], theta, 0.0)
-    checks.finite("features", features, largest=_LARGEST)
-    checks.finite("theta", theta, largest=_LARGEST)
+    checks.finite("features", features, largest=checks.LARGEST)
+    checks.finite("theta", theta, largest=checks.LARGEST)
     total = jnp.sum(weights)
     weights = weights / jnp.where(total > 0, total, 1.0)
 

@@ -166,10 +166,10 @@ def test_takes_any_features_and_several_contexts(key):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"kl_bound": 0}, "kl_bound must be a finite number above 0, got 0"),
+        ({"kl_bound": 0}, "kl_bound must be finite and above 0, got 0"),
         ({"kl_bound": float("nan")}, "got nan"),
         ({"archive_size": 0}, "archive_size must be at least 1, got 0"),
-        ({"ridge": -1.0}, "ridge must be a finite number of at least 0, got -1.0"),
+        ({"ridge": -1.0}, "ridge must be finite and at least 0, got -1.0"),
         ({"baseline_features": linear_features(3)}, "same context, got 1 and 3"),
         ({"m_step": bounded_ml}, r"such as bounded_ml\(\), got bounded_ml without its parentheses"),
     ],
@@ -209,7 +209,7 @@ def test_refuses_contexts_of_the_wrong_shape(key, state, shape):
 
 def test_refuses_contexts_that_are_not_finite(key, state):
     for call in (lambda c: ALGORITHM.ask(key, state, c), lambda c: ALGORITHM.mean(state.policy, c)):
-        with pytest.raises(ValueError, match="contexts must be finite numbers, got nan"):
+        with pytest.raises(ValueError, match="contexts must be finite, got nan"):
             call(np.array([[0.5], [np.nan]]))
         np.testing.assert_array_equal(
             jax.jit(call)(jnp.full((1, 1), jnp.nan)), np.full((1, THETA_DIM), np.nan)

@@ -386,7 +386,7 @@ def test_sample_kl_lies_between_zero_and_the_logarithm_of_the_count():
 
 @pytest.mark.parametrize("kl_bound", [0.0, -1.0, np.nan, np.inf])
 def test_bad_bound_is_named(kl_bound):
-    with pytest.raises(ValueError, match=f"kl_bound must be a finite number above 0, got {kl_bound}"):
+    with pytest.raises(ValueError, match=f"kl_bound must be finite and above 0, got {kl_bound}"):
         solve_dual(jnp.zeros(3), jnp.zeros((3, 2)), kl_bound=kl_bound)
 
 
