@@ -12,6 +12,7 @@ from creps_jax.typing import Array, Float, PRNGKey, VectorLike
 __all__ = ["context_grid", "gaussian_contexts", "uniform_contexts"]
 
 Sampler = Callable[[PRNGKey], Array]
+"""(key) -> context (s,)."""
 
 
 def gaussian_contexts(

@@ -15,6 +15,7 @@ from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
 __all__ = ["DualSolution", "dual_objective", "sample_kl", "sample_weights", "solve_dual"]
 
 Valid: TypeAlias = Bool[Array, " n"] | Float[Array, " n"]
+"""Which samples count, or as numbers: how much each counts."""
 
 _NUM_ROUNDS = 4
 """Most rounds of standardising and minimising, before and after the bound may be given up."""

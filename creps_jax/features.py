@@ -10,7 +10,7 @@ import numpy as np
 from creps_jax import checks
 from creps_jax.typing import Array, Float, VectorLike
 
-__all__ = ["FeatureMap", "linear_features", "quadratic_features", "rbf_features"]
+__all__ = ["FeatureMap", "linear_features", "quadratic_features", "rbf_features", "rbf_grid"]
 
 _FAR = 1e20
 """Distance from the range, in bandwidths, beyond which a context counts as that far: no overflow."""
@@ -100,11 +100,9 @@ def rbf_features(
     Source: Abdolmaleki et al. 2016, Eq. 16. The paper prints the default width for sigma squared, whose unit
     it does not have.
     """
-    lows, highs, widths = _rbf_settings(low, high, num_centers, bandwidth)
+    lows, highs, _ = _rbf_settings(low, high, num_centers, bandwidth)
+    centers, widths = rbf_grid(low, high, num_centers, bandwidth=bandwidth)
     dim = lows.size
-    places = np.linspace(0.0, 1.0, num_centers) if num_centers > 1 else np.array([0.5])
-    grid = np.stack(np.meshgrid(*[places] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
-    centers = lows + grid * (highs - lows)
 
     def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
         context = _checked_context(context, dim)
@@ -118,6 +116,29 @@ def rbf_features(
         return jax.nn.softmax(log_weights)
 
     return FeatureMap(apply, centers.shape[0], dim, scale=(1.0,) * centers.shape[0])
+
+
+def rbf_grid(
+    low: VectorLike, high: VectorLike, num_centers: int, *, bandwidth: VectorLike | None = None
+) -> tuple[Float[np.ndarray, "m s"], Float[np.ndarray, " s"]]:
+    """Place the centres of radial basis functions.
+
+    Args:
+        low: As in `rbf_features`, like the other arguments.
+        high: The same.
+        num_centers: The same.
+        bandwidth: The same.
+
+    Returns:
+        A row for each centre, in the order of the features, and the width along each context variable.
+
+    Raises:
+        ValueError: If `rbf_features` would refuse the settings.
+    """
+    lows, highs, widths = _rbf_settings(low, high, num_centers, bandwidth)
+    places = np.linspace(0.0, 1.0, num_centers) if num_centers > 1 else np.array([0.5])
+    grid = np.stack(np.meshgrid(*[places] * lows.size, indexing="ij"), axis=-1).reshape(-1, lows.size)
+    return lows + grid * (highs - lows), widths
 
 
 def _rbf_settings(

@@ -39,7 +39,7 @@ class WeightedSamples(NamedTuple):
 
 
 MStep = Callable[..., LinearGaussian]
-"""(old policy, samples, *, ridge, scale) -> new policy; see `fit_weighted_ml` for the settings."""
+"""`(old policy, samples, *, ridge, scale) -> new policy`; see `fit_weighted_ml` for the settings."""
 
 
 def weighted_ml(
@@ -87,7 +87,7 @@ def bounded_ml(
         ValueError: If a bound is not a positive number.
 
     Source: The parts are bounded apart as in Abdolmaleki et al. 2018, Maximum a posteriori policy
-        optimisation, Section 4.2.1; here in the other direction of the relative entropy, and exact.
+    optimisation, Section 4.2.1; here in the other direction of the relative entropy, and exact.
     """
     bounds = {"mean_kl_bound": mean_kl_bound, "cov_kl_bound": cov_kl_bound}
     if entropy_loss_bound is not None:

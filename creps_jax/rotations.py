@@ -17,6 +17,19 @@ from jaxtyping import Array, Float
 
 from creps_jax.typing import ScalarLike
 
+__all__ = [
+    "matrix_to_rpy",
+    "quat_to_matrix",
+    "quat_to_rpy",
+    "rigid_transform",
+    "rotation_x",
+    "rotation_y",
+    "rotation_z",
+    "rpy_to_matrix",
+    "rpy_to_quat",
+    "safe_arctan2",
+]
+
 _TINY = 1e-12
 
 

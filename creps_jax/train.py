@@ -33,6 +33,7 @@ from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
 __all__ = ["IterationLog", "evaluate", "make_iteration", "train", "train_trials"]
 
 OnIteration = Callable[[CrepsState, "IterationLog"], Any]
+"""Called as (state, log) after an iteration; what it returns is not used."""
 
 
 class IterationLog(NamedTuple):
@@ -169,8 +170,10 @@ def train_trials(
         )
     phases = _phases(task, algorithm, states, iterations, samples, first_samples, devices)
     setup = phases[0][0]
-    place = spread_rows if _shares_trials(setup, num_trials) else replicate
-    keys, states = place((keys, states), setup.devices)
+    if _shares_trials(setup, num_trials):
+        keys, states = spread_rows((keys, states), setup.devices)
+    else:
+        states = replicate(states, setup.devices)
     states, logs = _run(_iterate_trials, phases, keys, states, on_iteration)
     return states, jax.tree.map(lambda x: jnp.asarray(np.swapaxes(x, 0, 1)), logs)
 
@@ -265,8 +268,12 @@ def _sample_context(task: Task, key: PRNGKey) -> Array:
 
 
 def _shares_trials(setup: _Setup, num_trials: int) -> bool:
-    """Say whether devices share trials, which beats sharing rollouts: updates are shared as well."""
-    return len(setup.devices) > 1 and num_trials % len(setup.devices) == 0
+    """Say whether devices share trials, which beats sharing rollouts: updates are shared as well.
+
+    Not those of several processes: each one goes on with, and reports, all trials.
+    """
+    num_processes = len({device.process_index for device in setup.devices})
+    return len(setup.devices) > 1 and num_processes == 1 and num_trials % len(setup.devices) == 0
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))

@@ -1,4 +1,4 @@
-"""Read the command line: `python -m experiments list | run NAME | plot NAME | check | video`.
+"""Read the command line, `python -m experiments list | run | plot | check | video | export | session`.
 
 Nothing heavy is imported before it is clear that it is needed: help and mistakes are answered at once.
 """
@@ -15,7 +15,9 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
 from experiments import registry
 from experiments.errors import UserError
-from experiments.process import import_mjx_quietly
+from experiments.process import import_mjx_quietly, join_processes
+from experiments.session import commands
+from experiments.session.commands import SessionCommand
 
 OVERVIEW = """\
 Learn, plot and check what the project can do.
@@ -28,6 +30,8 @@ Learn, plot and check what the project can do.
   python -m experiments plot walk                 draw the figures of the latest results again
   python -m experiments check                     hold the latest results against the paper
   python -m experiments video                     film a policy at several speeds
+  python -m experiments export --to walk.h        write a policy (.onnx, .h) or a walk (.csv, .npz)
+  python -m experiments session                   learn on a real robot, trial by trial
 
 Results go to results/. Add --help to any of these for all its options.
 """
@@ -39,6 +43,7 @@ _Names = Annotated[tuple[str, ...], arg(metavar="[NAME ...]", help_behavior_hint
 _Text = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 _Integer = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
 _Number = Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")]
+_Seconds = Annotated[float | None, arg(metavar="S", help_behavior_hint="")]
 _File = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="")]
 
 
@@ -60,6 +65,8 @@ class Run:
         out: Result folder; a new one in results/ by default.
         resume: Go on with the run in the folder --out, or with the latest unfinished one.
         physics: What steps the robot: mjx, or c, which starts sooner (walk and fig11_walk only).
+        distributed: This is one of several processes, on one host or many, that share the run; see
+            docs/several_machines.md.
         speed: Learn nothing and show one walk at this speed in m/s (walk only).
         policy: Policy file for --speed; the latest learned or else the shipped one by default.
     """
@@ -72,6 +79,7 @@ class Run:
     out: _File = None
     resume: bool = False
     physics: _Text = None
+    distributed: bool = False
     speed: _Number = None
     policy: _File = None
 
@@ -117,12 +125,32 @@ class Video:
     seed: int = 0
 
 
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Write a policy, or the joint set-points of one of its walks, for use elsewhere.
+
+    Attributes:
+        to: The file. The policy becomes an ONNX model (.onnx) or a C header (.h); a walk, played from
+            standstill and without posture feedback, becomes a table (.csv) or arrays (.npz).
+        policy: Policy file; the latest learned or else the shipped one of walking by default.
+        speed: Speed of the walk in m/s (.csv and .npz only).
+        duration: Length of the walk in s (.csv and .npz only); 8 by default.
+    """
+
+    to: Annotated[Path, arg(metavar="FILE")]
+    policy: _File = None
+    speed: _Number = None
+    duration: _Seconds = None
+
+
 Command = (
     Annotated[List, subcommand("list")]
     | Annotated[Run, subcommand("run")]
     | Annotated[Plot, subcommand("plot")]
     | Annotated[Check, subcommand("check")]
     | Annotated[Video, subcommand("video")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[SessionCommand, subcommand("session")]
 )
 
 
@@ -172,6 +200,8 @@ def _run(command: Run) -> int:
         return _show(command, command.speed)
     if command.policy is not None:
         raise UserError("--policy goes with --speed")
+    if command.distributed:
+        join_processes()
     import_mjx_quietly()
     from rich.console import Console
 
@@ -245,4 +275,24 @@ def _video(command: Video) -> int:
     return 0
 
 
-_HANDLERS = {List: _list, Run: _run, Plot: _plot, Check: _check, Video: _video}
+def _export(command: Export) -> int:
+    from experiments.export import export
+
+    export(command.to, command.policy, speed=command.speed, duration=command.duration, say=_say)
+    return 0
+
+
+def _session(command: SessionCommand) -> int:
+    commands.run(command, say=_say)
+    return 0
+
+
+_HANDLERS = {
+    List: _list,
+    Run: _run,
+    Plot: _plot,
+    Check: _check,
+    Video: _video,
+    Export: _export,
+    SessionCommand: _session,
+}

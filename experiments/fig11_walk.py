@@ -19,8 +19,8 @@ from experiments.tables import PAPER_LINEAR, PAPER_RBF, save_table
 CONTENDERS: dict[str, dict[str, Any]] = {
     "rbf": {},
     "linear": {"features": Features("linear")},
-    "penalty": {"features": Features("linear"), "constraint": "penalty"},
     "unbounded": {"mean_kl_bound": None, "cov_kl_bound": None},
+    "penalty": {"features": Features("linear"), "constraint": "penalty"},
 }
 """What each changes of the settings; the paper compares constraints with linear policies."""
 

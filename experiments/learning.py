@@ -33,11 +33,13 @@ class Session:
         folder: the result folder; None keeps nothing.
         identity: what tells this run from others, see `save_checkpoint`.
         console: where progress is shown; None shows nothing.
+        is_keeper: whether this process writes to the folder: one of those that share a run does.
     """
 
     folder: Path | None = None
     identity: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     console: Console | None = None
+    is_keeper: bool = True
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +105,7 @@ def learn(
         plan: iterations and samples.
         session: where to keep checkpoints and show progress.
         name: names the checkpoint, `checkpoint-NAME.npz`, and heads the progress.
-        devices: devices that share the rollouts, by default all local ones.
+        devices: devices that share the rollouts, by default those of all processes.
 
     Returns:
         The last states (trials, ...), and the logs by name (trials, iterations, ...); `coef` among
@@ -120,7 +122,12 @@ def learn(
     latest = Checkpoint(states, {})
     if path is not None and path.exists():
         latest = load_checkpoint(path, states, run=identity)
-    keeper = _Keeper(latest, lambda checkpoint: path and save_checkpoint(path, checkpoint, run=identity))
+
+    def save(checkpoint: Checkpoint) -> None:
+        if path is not None and session.is_keeper:
+            save_checkpoint(path, checkpoint, run=identity)
+
+    keeper = _Keeper(latest, save)
     done = len(latest.log["mean_reward"]) if latest.log else 0
     if done < plan.iterations:
         with _Reporter(name, plan, done=done, console=session.console) as report, keeper:
@@ -138,7 +145,7 @@ def learn(
                 samples=plan.samples,
                 first_samples=plan.first_samples,
                 on_iteration=on_iteration,
-                devices=devices,
+                devices=jax.devices() if devices is None else devices,
             )
     latest = keeper.latest
     # A run that is resumed with fewer iterations than it has keeps what it has.

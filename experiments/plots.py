@@ -3,12 +3,13 @@
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
@@ -277,6 +278,85 @@ def reached_against_asked(
     axes.set(xlabel="asked speed (m/s)", ylabel="reached speed (m/s)", title=title)
     axes.legend(loc="upper left")
     return figure
+
+
+class Map(NamedTuple):
+    """A number over two context variables.
+
+    Attributes:
+        values: (nx, ny).
+        title: what it is, with its unit.
+        limits: the values at both ends of the colours; by default the lowest and the highest.
+        cell: how a number is written into its cell, "{:.0f}" for example; None leaves it to the colours.
+        colours: a colour map of matplotlib.
+    """
+
+    values: np.ndarray
+    title: str
+    limits: tuple[float, float] | None = None
+    cell: str | None = None
+    colours: str = "viridis"
+
+
+def context_maps(
+    maps: Sequence[Map],
+    x: np.ndarray,
+    y: np.ndarray,
+    *,
+    labels: tuple[str, str],
+    title: str,
+    columns: int | None = None,
+) -> Figure:
+    """Draw numbers over two context variables as coloured cells, one map beside the other.
+
+    Args:
+        maps: what to draw.
+        x: (nx,) values of the first context variable, equally spaced.
+        y: (ny,) values of the second one.
+        labels: names and units of the two.
+        title: heading of the figure.
+        columns: maps side by side; all by default.
+    """
+    columns = columns or len(maps)
+    rows = math.ceil(len(maps) / columns)
+    figure, grid = new_figure(
+        rows,
+        columns,
+        width=min(4.4, 15.0 / columns) * columns,
+        height=2.7 * rows + 0.5,
+        sharex=True,
+        sharey=True,
+    )
+    for axes in grid.flat[len(maps) :]:
+        axes.set_visible(False)
+    for axes, (values, heading, limits, cell, colours) in zip(grid.flat, maps, strict=False):
+        low, high = limits or (np.nanmin(values), np.nanmax(values))
+        mesh = axes.pcolormesh(x, y, values.T, vmin=low, vmax=high, cmap=colours, shading="nearest")
+        figure.colorbar(mesh, ax=axes)
+        axes.grid(False)
+        axes.set_title(heading, fontsize=9)
+        for (i, j), value in np.ndenumerate(values if cell is not None else np.empty((0, 0))):
+            axes.text(
+                x[i],
+                y[j],
+                str(cell).format(value),
+                ha="center",
+                va="center",
+                fontsize=7,
+                color=_ink(mesh, value),
+            )
+    for axes in grid[-1]:
+        axes.set_xlabel(labels[0])
+    for axes in grid[:, 0]:
+        axes.set_ylabel(labels[1])
+    figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
+    return figure
+
+
+def _ink(mesh: QuadMesh, value: float) -> str:
+    """Return the colour, black or white, in which text can be read on the colour of a value."""
+    red, green, blue, _ = mesh.to_rgba(np.array([value]))[0]
+    return "black" if 0.3 * red + 0.59 * green + 0.11 * blue > 0.5 else "white"
 
 
 def plot_policy(

@@ -5,6 +5,8 @@ import io
 import os
 from pathlib import Path
 
+from experiments.errors import UserError
+
 # One thread a device, and the small matrix products of the physics without the set-up costs of a library
 # for large ones. XLA ends the process on a flag it does not know: jaxlib 0.9.0 and 0.12.0 know both.
 XLA_FLAGS = ("--xla_cpu_multi_thread_eigen=false", "--xla_cpu_experimental_ynn_fusion_type=")
@@ -47,6 +49,32 @@ def prepare() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
+
+
+def join_processes() -> None:
+    """Let this process and its peers share their devices, before jax does anything else.
+
+    SLURM, Open MPI and Kubernetes tell each process what it has to know. Elsewhere the environment does:
+    JAX_COORDINATOR_ADDRESS (host:port of the first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID (from 0).
+
+    Raises:
+        UserError: if neither does, or the others are not to be reached.
+    """
+    import jax
+
+    num, number = (os.environ.get(f"JAX_{name}") for name in ("NUM_PROCESSES", "PROCESS_ID"))
+    try:
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        jax.distributed.initialize(
+            num_processes=None if num is None else int(num),
+            process_id=None if number is None else int(number),
+        )
+    except (ValueError, RuntimeError) as error:
+        raise UserError(
+            "cannot join the other processes; JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID are "
+            f"{os.environ.get('JAX_COORDINATOR_ADDRESS')}, {num}, {number}: "
+            f"{str(error).splitlines()[0]}"
+        ) from error
 
 
 def import_mjx_quietly() -> None:

@@ -2,7 +2,7 @@
 
 import difflib
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
@@ -11,10 +11,12 @@ from experiments.errors import UserError
 
 DESCRIPTIONS = {
     "walk": "a NAO learns to walk at the speed you ask for (the main job)",
+    "walk_slope": "the same up and down slopes: a context of speed and slope, learned from the shipped walk",
     "fig05_sinus": "learn the sine of the context, with linear and with RBF features (Fig. 5)",
     "fig06_reaching": "reach via-points with a planar arm (Fig. 6 and 7)",
     "fig08_hole": "reach into a hole with a planar arm (Fig. 8 and 9)",
     "fig11_walk": "ways to learn to walk: features, constraints, fits (Fig. 10, 11a and Table 2)",
+    "walk_inside": "what is planned and what the robot does, in a walk that stays up and in one that falls",
     "updates": "the paper's fit of the policy against the bounded one, on all tasks but walking",
 }
 """What each experiment shows; its module has the same name."""
@@ -67,7 +69,7 @@ def check_name(name: str) -> None:
         UserError: with the nearest name, and all of them.
     """
     if name not in DESCRIPTIONS:
-        raise UserError(f"unknown experiment {name!r}{_suggest(name, DESCRIPTIONS)}")
+        raise UserError(f"unknown experiment {name!r}{suggest(name, DESCRIPTIONS)}")
 
 
 def load(name: str) -> Experiment:
@@ -87,11 +89,13 @@ def preset_settings(experiment: Experiment, preset: str) -> Any:
         UserError: if the experiment has none of that name.
     """
     if preset not in experiment.SETTINGS:
-        raise UserError(f"unknown preset {preset!r}{_suggest(preset, experiment.SETTINGS)}")
+        raise UserError(f"unknown preset {preset!r}{suggest(preset, experiment.SETTINGS)}")
     return experiment.SETTINGS[preset]
 
 
-def _suggest(name: str, known: Mapping[str, object]) -> str:
+def suggest(name: str, known: Iterable[str]) -> str:
+    """Return how an error about an unknown name goes on: with the nearest one, and all of them."""
+    known = list(known)
     near = difflib.get_close_matches(name, known, n=1)
     hint = f", did you mean {near[0]!r}?" if near else ","
     return f"{hint} choose from: {', '.join(known)}"

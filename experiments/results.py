@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import datetime
+import errno
 import importlib.metadata
 import json
 import os
@@ -50,7 +51,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             file.flush()
             os.fsync(file.fileno())
         # mkstemp makes files private; results are as readable as any other file.
-        temporary.chmod(0o666 & ~_umask())
+        temporary.chmod(0o666 & ~umask())
         os.replace(temporary, path)
         temporary = None
     except OSError as error:
@@ -62,6 +63,26 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """See that the names in a folder, and not only what their files hold, last a loss of power.
+
+    Raises:
+        UserError: if the disk refuses.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        # Some network file systems know no such thing; there is nothing more to be done on them.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            reason = error.strerror or error
+            raise UserError(f"what was written to {folder} may not last a loss of power: {reason}") from error
 
 
 def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -98,6 +119,30 @@ def save_text(path: Path, text: str) -> None:
 def save_json(path: Path, values: Any) -> None:
     """Write values as indented JSON, atomically."""
     save_text(path, json.dumps(values, indent=2, default=str) + "\n")
+
+
+def load_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        UserError: if there is none, it is cut short, it is no JSON, or it names a field twice.
+    """
+    try:
+        return json.loads(path.read_text("utf-8"), object_pairs_hook=_without_repetition)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise UserError(f"cannot read {path}: it is cut short, or no JSON file ({error})") from error
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"the field {name!r} is there twice")
+    return dict(pairs)
 
 
 def save_figure(path: Path, figure: Any) -> None:
@@ -186,14 +231,9 @@ def load_manifest(folder: Path) -> dict[str, Any]:
         UserError: if there is none, or it is no manifest.
     """
     path = folder / MANIFEST
-    try:
-        manifest = json.loads(path.read_text())
-    except FileNotFoundError as error:
-        raise UserError(f"{folder} is no result folder: it has no {MANIFEST}") from error
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:
-        raise UserError(f"cannot read {path}: it is cut short, or no JSON file") from error
+    if not path.exists():
+        raise UserError(f"{folder} is no result folder: it has no {MANIFEST}")
+    manifest = load_json(path)
     if not isinstance(manifest, dict) or not isinstance(manifest.get("settings"), dict):
         raise UserError(f"{path} is no manifest of an experiment")
     return manifest
@@ -238,7 +278,8 @@ def processor_name() -> str:
     return platform.processor() or platform.machine()
 
 
-def _umask() -> int:
+def umask() -> int:
+    """Return which permissions new files of this process do not get."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -60,6 +60,10 @@ def run(request: Request, *, console: Console | None, say: Say) -> Path:
     """
     registry.check_name(request.name)
     experiment = registry.load(request.name)
+    if jax.process_count() > 1 and request.out is None:
+        raise UserError("processes that share a run need --out, a folder that all of them see")
+    if jax.process_index() > 0:
+        return _help(experiment, request)
     settings, folder, manifest = (_resumed if request.resume else _started)(experiment, request)
     say(f"results go to {folder}")
     before, begin = manifest["seconds"], time.monotonic()
@@ -88,6 +92,19 @@ def run(request: Request, *, console: Console | None, say: Say) -> Path:
     _save_claims(experiment, arrays, folder)
     say(f"finished in {manifest['seconds']:.0f} s: {folder}")
     return folder
+
+
+def _help(experiment: registry.Experiment, request: Request) -> Path:
+    """Share the run of the first process, which alone writes and speaks."""
+    if request.resume:
+        settings, folder, manifest = _resumed(experiment, request)
+        seed = manifest["seed"]
+    else:
+        # The first process makes the folder: whether it is there yet says nothing.
+        settings, folder, seed = _settings(experiment, request)[1], None, request.seed or 0
+    session = Session(folder, _identity(request.name, settings, seed), is_keeper=False)
+    experiment.run(settings, jax.random.key(seed), session)
+    return request.out or Path()
 
 
 def plot(name: str, folder: Path | None, *, say: Say) -> Path:
@@ -135,10 +152,15 @@ def claim_rows(experiment: registry.Experiment, arrays: Mapping[str, np.ndarray]
     return rows
 
 
+def _settings(experiment: registry.Experiment, request: Request) -> tuple[str, Any]:
+    """Return the preset and the settings of a run from the beginning."""
+    preset = request.preset or next(iter(experiment.SETTINGS))
+    return preset, _override(registry.preset_settings(experiment, preset), request)
+
+
 def _started(experiment: registry.Experiment, request: Request) -> tuple[Any, Path, dict[str, Any]]:
     """Return settings, an empty result folder and a manifest for a run from the beginning."""
-    preset = request.preset or next(iter(experiment.SETTINGS))
-    settings = _override(registry.preset_settings(experiment, preset), request)
+    preset, settings = _settings(experiment, request)
     folder = request.out
     if folder is None:
         folder = results.new_folder(results.default_root() / request.name, f"{results.stamp()}-{preset}")

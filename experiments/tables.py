@@ -39,7 +39,7 @@ def to_csv(columns: Mapping[str, Sequence[object]]) -> str:
 def to_markdown(columns: Mapping[str, Sequence[object]]) -> str:
     """Write columns of equal length as a Markdown table; floats get three decimals."""
     rows = [[_cell(value) for value in row] for row in zip(*columns.values(), strict=True)]
-    widths = [max(len(name), *(len(row[i]) for row in rows)) for i, name in enumerate(columns)]
+    widths = [max([len(name), *(len(row[i]) for row in rows)]) for i, name in enumerate(columns)]
 
     def line(cells: Sequence[str]) -> str:
         return "| " + " | ".join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True)) + " |"

@@ -32,11 +32,13 @@ class Clip(NamedTuple):
         caption: one line of text.
         qpos: (n, nq) generalised positions.
         period: seconds between two of them.
+        slope: degrees by which the floor, in whose frame positions are, rises ahead.
     """
 
     caption: str
     qpos: np.ndarray
     period: float
+    slope: float = 0.0
 
 
 class VideoError(UserError):
@@ -87,6 +89,7 @@ def _job(model: Path, clips: Sequence[Clip], still_at: float) -> dict[str, objec
     arrays: dict[str, object] = {"model": str(model.resolve()), "still_at": still_at}
     arrays["captions"] = np.array([clip.caption for clip in clips])
     arrays["periods"] = np.array([clip.period for clip in clips])
+    arrays["slopes"] = np.array([clip.slope for clip in clips])
     return arrays | {f"qpos{index}": np.asarray(clip.qpos) for index, clip in enumerate(clips)}
 
 
@@ -107,7 +110,12 @@ def _render_job(job: Path, video: Path, still: Path) -> None:
     arrays = load_arrays(job)
     captions = arrays["captions"].tolist()
     clips = [
-        Clip(caption, arrays[f"qpos{index}"].astype(float), float(arrays["periods"][index]))
+        Clip(
+            caption,
+            arrays[f"qpos{index}"].astype(float),
+            float(arrays["periods"][index]),
+            float(arrays["slopes"][index]),
+        )
         for index, caption in enumerate(captions)
     ]
     columns, rows = layout(len(clips))
@@ -164,7 +172,7 @@ def _frames(
                 data.qpos[:] = clip.qpos[index]
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_camlight(model, data)
-                camera.lookat[:] = (*path[index], 0.26)
+                camera.lookat[:] = _tilt(data, clip.slope) @ (*path[index], 0.26)
                 renderer.update_scene(data, camera)
                 image = Image.fromarray(renderer.render()).reduce(factor)
                 row, column = divmod(cell, columns)
@@ -172,6 +180,17 @@ def _frames(
                     image, clip.caption, index * clip.period, scale
                 )
             yield frame
+
+
+def _tilt(data, slope: float) -> np.ndarray:
+    """Turn all that is drawn from the frame of the floor to the vertical, and return the rotation."""
+    angle = math.radians(slope)
+    rotation = np.array(
+        [[math.cos(angle), 0.0, -math.sin(angle)], [0.0, 1.0, 0.0], [math.sin(angle), 0.0, math.cos(angle)]]
+    )
+    data.geom_xpos[:] = data.geom_xpos @ rotation.T
+    data.geom_xmat[:] = (rotation @ data.geom_xmat.reshape(-1, 3, 3)).reshape(-1, 9)
+    return rotation
 
 
 def _captioned(image, caption: str, seconds: float, scale: int) -> np.ndarray:

@@ -20,6 +20,7 @@ from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c, mjx
 from creps_jax.policy import LinearGaussian
 from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constrained
+from creps_jax.tasks.conditions import Condition
 from creps_jax.tasks.nao_walk import WalkNoise, nao_walk
 from creps_jax.train import evaluate
 from experiments import plots, results, tables
@@ -115,6 +116,19 @@ class Settings:
         """Return how steps answer to the measured orientation."""
         return Balance(self.heading_gain, self.placement_gain)
 
+    def conditions(self) -> tuple[Condition, ...]:
+        """Return what the context holds besides the speed."""
+        return ()
+
+    def context_range(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the lowest and the highest value of each context variable."""
+        conditions = self.conditions()
+        return (self.low, *(c.low for c in conditions)), (self.high, *(c.high for c in conditions))
+
+    def margins(self) -> tuple[float, ...]:
+        """Return how far beyond its range each context variable is drawn in learning."""
+        return (self.margin,)
+
 
 _OURS = Settings(
     heading_gain=0.3,
@@ -159,9 +173,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         saved_policy(settings, LinearGaussian(*pair)) for pair in zip(*map(np.asarray, policy), strict=True)
     ]
     return {
-        "episodes": make_plan(settings).episodes(np.arange(1, log["mean_reward"].shape[1] + 1)),
-        "coef": np.asarray(policy.coef),
-        "cov_chol": np.asarray(policy.cov_chol),
+        **learned(settings, policy, log),
         "fine_speeds": fine,
         "fine_theta": np.stack([[policy.theta(float(speed)) for speed in fine] for policy in policies]),
         "speeds": speeds,
@@ -169,6 +181,15 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         "speed": outcome.speed,
         "fell": outcome.fell,
         **{f"bound_{side}": np.array(BOUNDS[settings.bounds][i]) for i, side in enumerate(("low", "high"))},
+    }
+
+
+def learned(settings: Settings, policy: LinearGaussian, log: Log) -> dict[str, np.ndarray]:
+    """Return what learning left behind, as arrays: the policies, the log, and the episodes by iteration."""
+    return {
+        "episodes": make_plan(settings).episodes(np.arange(1, log["mean_reward"].shape[1] + 1)),
+        "coef": np.asarray(policy.coef),
+        "cov_chol": np.asarray(policy.cov_chol),
         **{f"log.{name}": values for name, values in log.items()},
     }
 
@@ -185,15 +206,15 @@ def make_plan(settings: Settings) -> Plan:
 
 
 def learn_to_walk(
-    settings: Settings, key: jax.Array, *, session: Session, name: str
+    settings: Settings, key: jax.Array, *, session: Session, name: str, start: LinearGaussian | None = None
 ) -> tuple[CrepsState, Log]:
-    """Learn in all trials; see `experiments.learning.learn`, whose log this is."""
+    """Learn in all trials, by default from `first_policy` on; see `learn`, whose log this is."""
     task = make_task(settings, noise=settings.learning_noise, duration=settings.learning_duration)
     return learn(
         trial_keys(key, settings.trials),
         average_repeats(task, settings.repeats),
         make_algorithm(settings),
-        first_policy(settings),
+        first_policy(settings) if start is None else start,
         make_plan(settings),
         session=session,
         name=name,
@@ -207,8 +228,9 @@ def walk_at_all_speeds(settings: Settings, key: jax.Array, policy: LinearGaussia
         The speeds (n,), m/s, and the outcome (trials, n, seeds).
     """
     speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
-    thetas = np.asarray(jax.vmap(make_algorithm(settings).mean, (0, None))(policy, speeds[:, None]))
-    return speeds, evaluate_trials(key, make_task(settings), speeds, thetas, repeats=settings.eval_seeds)
+    contexts = speeds[:, None]
+    thetas = np.asarray(jax.vmap(make_algorithm(settings).mean, (0, None))(policy, contexts))
+    return speeds, evaluate_trials(key, make_task(settings), contexts, thetas, repeats=settings.eval_seeds)
 
 
 def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None = None) -> Task:
@@ -219,17 +241,17 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
         noise: how many times the usual noise.
         duration: length of an episode, s; by default that of the evaluation.
     """
+    low, high, margin = map(np.array, (*settings.context_range(), settings.margins()))
     task = nao_walk(
         settings.low,
         settings.high,
-        sample_context=SAMPLERS[settings.sampler](
-            settings.low - settings.margin, settings.high + settings.margin
-        ),
+        sample_context=SAMPLERS[settings.sampler](low - margin, high + margin),
         duration=settings.duration if duration is None else duration,
         start_up=START_UP,
         noise=WalkNoise().times(noise),
         balance=settings.balance(),
         physics=PHYSICS[settings.physics],
+        conditions=settings.conditions(),
     )
     if settings.constraint == "penalty":
         return penalised(task, *BOUNDS[settings.bounds], PENALTY)
@@ -238,8 +260,8 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
 
 def make_algorithm(settings: Settings) -> Creps:
     """Set up contextual REPS; the RBFs serve as policy and as baseline features."""
-    features = settings.features.make(settings.low, settings.high)
-    baseline = quadratic_features(1) if settings.features.kind == "linear" else features
+    features = settings.features.make(*settings.context_range())
+    baseline = quadratic_features(features.context_dim) if settings.features.kind == "linear" else features
     return creps(
         features,
         baseline,
@@ -250,8 +272,8 @@ def make_algorithm(settings: Settings) -> Creps:
 
 
 def first_policy(settings: Settings) -> LinearGaussian:
-    """Return the policy to begin with: the same for every speed."""
-    num_features = settings.features.make(settings.low, settings.high).size
+    """Return the policy to begin with: the same for every context."""
+    num_features = settings.features.make(*settings.context_range()).size
     mean, std = (
         jnp.full(len(PARAM_NAMES), settings.start_mean),
         jnp.full(len(PARAM_NAMES), settings.start_std),
@@ -269,24 +291,32 @@ def first_policy(settings: Settings) -> LinearGaussian:
 def evaluate_trials(
     key: jax.Array, task: Task, contexts: np.ndarray, thetas: np.ndarray, *, repeats: int
 ) -> Any:
-    """Roll out the parameters (trials, n, d) of each trial; outcome with axes (trials, n, repeats)."""
+    """Roll out the parameters (trials, n, d) of each trial in n contexts; outcome (trials, n, repeats)."""
     trials, num, _ = thetas.shape
-    rows = jnp.tile(jnp.asarray(contexts)[:, None], (trials, 1))
-    outcome = evaluate(key, task, rows, jnp.asarray(thetas).reshape(trials * num, -1), repeats=repeats)
+    rows = jnp.tile(jnp.asarray(contexts), (trials, 1))
+    thetas = thetas.reshape(trials * num, -1)
+    outcome = evaluate(key, task, rows, jnp.asarray(thetas), repeats=repeats, devices=jax.devices())
     return jax.tree.map(lambda leaf: np.asarray(leaf).reshape(trials, num, *leaf.shape[1:]), outcome)
+
+
+def physical(settings: Settings, free: np.ndarray) -> np.ndarray:
+    """Turn parameters (..., d) as a squashed policy gives them into those that the robot walks with."""
+    return np.asarray(sigmoid_gate(jnp.asarray(free), *map(jnp.asarray, BOUNDS[settings.bounds])))
 
 
 def saved_policy(settings: Settings, policy: LinearGaussian) -> SavedPolicy:
     """Put a policy together with all that is needed to use it."""
+    conditions = settings.conditions()
+    context_low, context_high = settings.context_range()
     low, high = BOUNDS[settings.bounds]
     return SavedPolicy(
         coef=np.asarray(policy.coef),
         cov_chol=np.asarray(policy.cov_chol),
         features=settings.features,
-        context_names=("speed",),
-        context_units=("m/s",),
-        context_low=(settings.low,),
-        context_high=(settings.high,),
+        context_names=("speed", *(condition.name for condition in conditions)),
+        context_units=("m/s", *(condition.unit for condition in conditions)),
+        context_low=context_low,
+        context_high=context_high,
         param_names=PARAM_NAMES,
         param_units=PARAM_UNITS,
         param_low=low,
@@ -307,20 +337,11 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     speeds = arrays["speeds"].astype(float)
     lowest = np.asarray(tables.PAPER_SPEEDS) - np.sqrt(-np.asarray(tables.PAPER_RBF) / 10)
     return {
-        "learning_curve": plots.learning_curves(
-            {"Learning to walk": {"new samples": (arrays["episodes"], arrays["log.mean_reward"])}}
-        ),
-        "updates": plots.update_traces(
-            arrays["episodes"],
-            {"walk": {field: arrays[f"log.info.{field}"] for field in plots.TRACES}},
-        ),
+        **plot_learning(arrays),
         "parameters": plots.parameters_against_context(
             arrays["fine_speeds"],
             arrays["fine_theta"],
-            names=[
-                f"{name.replace('_', ' ')} {symbol}"
-                for name, symbol in zip(PARAM_NAMES, _symbols(), strict=True)
-            ],
+            names=param_titles(),
             units=PARAM_UNITS,
             low=arrays["bound_low"],
             high=arrays["bound_high"],
@@ -333,6 +354,19 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
             arrays["fell"][trial],
             title="Reached against asked speed",
             paper=lowest,
+        ),
+    }
+
+
+def plot_learning(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+    """Draw the learning curve, and how far updates moved."""
+    return {
+        "learning_curve": plots.learning_curves(
+            {"Learning to walk": {"new samples": (arrays["episodes"], arrays["log.mean_reward"])}}
+        ),
+        "updates": plots.update_traces(
+            arrays["episodes"],
+            {"walk": {field: arrays[f"log.info.{field}"] for field in plots.TRACES}},
         ),
     }
 
@@ -353,6 +387,13 @@ def finish(
     say(f"\n{tables.to_markdown(columns)}")
     speeds = [speed for speed in FILMED_SPEEDS if settings.low <= speed <= settings.high]
     save_film(record(policy, speeds, seed=0, duration=settings.duration), folder / "walk.mp4", say)
+
+
+def param_titles() -> list[str]:
+    """Return the walking parameters' names with the paper's symbols."""
+    return [
+        f"{name.replace('_', ' ')} {symbol}" for name, symbol in zip(PARAM_NAMES, _symbols(), strict=True)
+    ]
 
 
 def _symbols() -> list[str]:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import jax
@@ -12,6 +11,7 @@ import numpy as np
 from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c
+from creps_jax.tasks.conditions import slope
 from creps_jax.tasks.nao_walk import CONTROL_PERIOD, record_walk
 from experiments import results
 from experiments.errors import UserError
@@ -70,27 +70,48 @@ def film(
     save_film(clips, out, say)
 
 
-def record(policy: SavedPolicy, speeds: Sequence[float], *, seed: int, duration: float = 8.0) -> list[Clip]:
+def record(
+    policy: SavedPolicy,
+    speeds: Sequence[float],
+    *,
+    seed: int,
+    duration: float = 8.0,
+    slopes: Sequence[float] | None = None,
+) -> list[Clip]:
     """Record a walk at each speed, captioned with asked and reached speed.
 
+    Args:
+        policy: a policy of the speed, or of speed and slope.
+        speeds: asked speeds, m/s.
+        seed: seed of the noise.
+        duration: length of the walks, s.
+        slopes: slope of each walk, deg, for a policy that takes it.
+
     Raises:
-        ValueError: if there is no speed, or one is outside the range that was learned.
+        UserError: if there is no speed, or a context is not one that the policy has learned.
     """
     if not speeds:
         raise UserError("name at least one speed")
-    thetas = jnp.stack([jnp.asarray(policy.theta(speed)) for speed in speeds])
-    keys = jax.random.split(jax.random.key(seed), len(speeds))
-    balance = balance_of(policy)
+    ways = np.zeros((len(speeds), 0)) if slopes is None else np.array(slopes, float)[:, None]
+    thetas = jnp.stack(
+        [jnp.asarray(policy.theta(speed, *way)) for speed, way in zip(speeds, ways, strict=True)]
+    )
     # For a few walks, compiling MJX would take longer than they do.
-    walk = partial(record_walk, duration=duration, balance=balance, physics=c.make_control_step)
-    walks = jax.jit(jax.vmap(walk))(keys, thetas)
+    settings = {"duration": duration, "balance": balance_of(policy), "physics": c.make_control_step}
+    if slopes is not None:
+        settings["conditions"] = (slope(policy.context_low[1], policy.context_high[1]),)
+    walk = jax.jit(jax.vmap(lambda key, theta, way: record_walk(key, theta, values=way, **settings)))
+    keys = jax.random.split(jax.random.key(seed), len(speeds))
+    walks = walk(keys, thetas, jnp.asarray(ways, jnp.float32))
     qpos, fallen = np.asarray(walks.qpos), np.asarray(walks.has_fallen)
     clips = []
     for index, speed in enumerate(speeds):
         start = round(START_UP / CONTROL_PERIOD) - 1
         reached = (qpos[index, -1, 0] - qpos[index, start, 0]) / (duration - START_UP)
         verdict = "fell" if fallen[index, -1] else f"reached {reached:.2f} m/s"
-        clips.append(Clip(f"asked {speed:.2f} m/s, {verdict}", qpos[index], CONTROL_PERIOD))
+        rise = 0.0 if slopes is None else slopes[index]
+        where = "" if slopes is None else f"slope {rise:g}°, "
+        clips.append(Clip(f"{where}asked {speed:.2f} m/s, {verdict}", qpos[index], CONTROL_PERIOD, rise))
     return clips
 
 

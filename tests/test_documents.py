@@ -31,6 +31,14 @@ def test_notebook_runs(path, monkeypatch, tmp_path):
     notebook = nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
 
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    complaints = [output.text for output in outputs if output.get("name") == "stderr"]
+    assert not complaints
+    figures = [output.data for output in outputs if "<Figure" in output.get("data", {}).get("text/plain", "")]
+    assert figures
+    # A figure that Jupyter was not told to draw is shown as its name.
+    assert all("image/png" in data for data in figures)
+
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_has_no_outputs_and_is_paired(path):

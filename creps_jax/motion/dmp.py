@@ -64,7 +64,7 @@ def dmp_trajectory(
         ValueError: If there is no step or no basis, the duration is not positive, or shapes do not fit.
 
     Source: Ijspeert et al. 2013, Eq. 2.1 to 2.5, without scaling by the amplitude, which fails where start
-        and goal are equal; the forcing is divided by the spring's stiffness.
+    and goal are equal; the forcing is divided by the spring's stiffness.
     """
     if num_steps < 1:
         raise ValueError(f"num_steps must be at least 1, got {num_steps}")

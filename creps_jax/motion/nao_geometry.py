@@ -11,8 +11,25 @@ of a side can be vmapped over both legs.
 from math import radians
 from typing import NamedTuple
 
+__all__ = [
+    "GEOMETRY",
+    "JOINT_LOWER",
+    "JOINT_NAMES",
+    "JOINT_UPPER",
+    "LEFT",
+    "MAX_JOINT_SPEED",
+    "MAX_JOINT_TORQUE",
+    "NUM_JOINTS",
+    "RIGHT",
+    "NaoGeometry",
+    "leg_indices",
+]
+
 LEFT = 1.0
+"""The left side."""
+
 RIGHT = -1.0
+"""The right side."""
 
 
 class NaoGeometry(NamedTuple):
@@ -71,6 +88,7 @@ class NaoGeometry(NamedTuple):
 
 
 GEOMETRY = NaoGeometry()
+"""The lengths of the simulated NAO."""
 
 _HEAD = ("head_yaw", "head_pitch")
 _ARM = ("shoulder_pitch", "shoulder_yaw", "arm_roll", "elbow")
@@ -83,6 +101,7 @@ JOINT_NAMES: tuple[str, ...] = (
 """The order of every joint vector: head 2, left arm 4, right arm 4, left leg 6, right leg 6."""
 
 NUM_JOINTS = len(JOINT_NAMES)
+"""Length of every joint vector."""
 
 # Degrees, in the order above, with the simulator's signs: positive hip pitch swings the leg forward, the knee
 # bends with a negative angle, positive ankle pitch lifts the toes, positive shoulder pitch lifts the arm (at

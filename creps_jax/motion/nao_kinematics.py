@@ -4,7 +4,7 @@ A sole frame lies in the lower face of the foot, straight below the ankle, x tow
 (6,) is (hip yaw-pitch, hip roll, hip pitch, knee, ankle pitch, ankle roll) with the signs of `nao_geometry`.
 A side is `LEFT` or `RIGHT`, or any traced +1 / -1.
 
-With Rx, Ry, Rz for rotations about fixed axes, s for the side and q1..q6 for the joints, the leg is
+With Rx, Ry, Rz for rotations about fixed axes, s for the side and q1..q6 for the joints, the leg is::
 
     R_torso_thigh = Rx(45 s deg) Rz(-s q1) Rx(q2 - 45 s deg) Ry(-q3)
     R_torso_sole = R_torso_thigh Ry(-q4 - q5) Rx(q6)
@@ -22,6 +22,8 @@ from creps_jax import checks
 from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_UPPER, LEFT, RIGHT, leg_indices
 from creps_jax.rotations import rigid_transform, rotation_x, rotation_y, rotation_z, safe_arctan2
 from creps_jax.typing import Scalar, ScalarLike
+
+__all__ = ["MAX_REACH", "MIN_REACH", "leg_fk", "leg_ik"]
 
 _HIP_TILT = pi / 4.0
 

@@ -1,7 +1,10 @@
 """Step a robot with position servos by C MuJoCo, one control step of the whole batch at a time."""
 
 import contextlib
+import copy
+import operator
 import os
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +14,7 @@ from mujoco import rollout
 
 from creps_jax.physics.servos import read_servos
 from creps_jax.physics.state import ControlStep, RobotState, substep_shares
+from creps_jax.physics.world import World, changed_fields, world_of
 from creps_jax.typing import Array, Float
 
 __all__ = ["make_control_step"]
@@ -44,20 +48,22 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
 
     def make():
         data = [mujoco.MjData(model) for _ in range(_threads())]
-        return rollout.Rollout(nthread=len(data)), data
+        return _Tools(rollout.Rollout(nthread=len(data)), data, [])
 
+    world_sizes = tuple(np.size(leaf) for leaf in world_of(model))
     sizes = (model.nq, model.nv, model.nv, model.nu, model.nu, model.nu)
 
     def step_batch(packed):
-        rows = np.array(packed, float).reshape(-1, sum(sizes))
-        qpos, qvel, warmstart, before, after, speed = np.split(rows, np.cumsum(sizes)[:-1], axis=1)
+        rows = np.array(packed, float).reshape(-1, packed.shape[-1])
+        qpos, qvel, warmstart, before, after, speed, worlds = np.split(rows, np.cumsum(sizes), axis=1)
         control = before[:, None] + shares * (after - before)[:, None] + (lead * speed)[:, None]
         start = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
         is_lost = ~((np.abs(start) <= _LARGEST).all(axis=1) & np.isfinite(control).all(axis=(1, 2)))
         for array, stand_in in ((start, np.append(0.0, rest)), (control, 0.0), (warmstart, 0.0)):
             array[is_lost] = stand_in
-        with _borrowed(idle, make) as (pool, data):
-            states, _ = pool.rollout(model, data, start, control, initial_warmstart=warmstart)
+        with _borrowed(idle, make) as (pool, data, copies):
+            models = _models(model, copies, worlds, world_sizes) if worlds.size else model
+            states, _ = pool.rollout(models, data, start, control, initial_warmstart=warmstart)
         # C stands a robot up again whose state has become bad, with a new time, and leaves it there.
         is_lost |= states[:, -1, 0] < (num_substeps - 0.5) * model.opt.timestep
         is_lost |= ~(np.abs(states[:, -1]) <= _LARGEST).all(axis=1)
@@ -73,14 +79,35 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
         before: Float[Array, " nu"],
         after: Float[Array, " nu"],
         speed: Float[Array, " nu"],
+        world: World | None = None,
     ) -> RobotState:
         # One array each way: handing over many costs more than what is in them.
-        packed = jnp.concatenate([*state, before, after, speed])
+        leaves = () if world is None else (jnp.ravel(jnp.asarray(leaf, jnp.float32)) for leaf in world)
+        packed = jnp.concatenate([*state, before, after, speed, *leaves])
         shape = jax.ShapeDtypeStruct((sum(sizes[:3]),), jnp.float32)
         moved = jax.pure_callback(step_batch, shape, packed, vmap_method="broadcast_all")
         return RobotState(*jnp.split(moved, np.cumsum(sizes[:2])))
 
     return control_step
+
+
+class _Tools(NamedTuple):
+    """What one call works with."""
+
+    pool: rollout.Rollout
+    data: list[mujoco.MjData]
+    copies: list[mujoco.MjModel]
+    """Models for robots in worlds of their own, as many as a call needed so far."""
+
+
+def _models(model, copies, worlds, sizes):
+    """Return a copy of the model for each row of worlds, changed accordingly."""
+    copies.extend(copy.copy(model) for _ in range(len(worlds) - len(copies)))
+    for here, row in zip(copies, worlds, strict=False):
+        leaves = np.split(row, np.cumsum(sizes)[:-1])
+        for name, value in changed_fields(model, World(leaves[0], *(leaf[0] for leaf in leaves[1:]))).items():
+            operator.attrgetter(name)(here)[:] = value
+    return copies[: len(worlds)]
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import mujoco
 from jax import lax
@@ -10,6 +11,7 @@ from mujoco import mjx
 
 from creps_jax.physics.servos import Servos, read_servos
 from creps_jax.physics.state import ControlStep, RobotState, substep_shares
+from creps_jax.physics.world import World, changed_fields
 from creps_jax.typing import Array, Float
 
 __all__ = ["make_control_step"]
@@ -38,23 +40,30 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     """
     shares = substep_shares(num_substeps)
     step = _make_step(model)
+    device_model = mjx.put_model(model)
 
     def control_step(
         state: RobotState,
         before: Float[Array, " nu"],
         after: Float[Array, " nu"],
         speed: Float[Array, " nu"],
+        world: World | None = None,
     ) -> RobotState:
+        here = device_model
+        if world is not None:
+            # Of NumPy arrays MJX would ask that they are the same for all bodies.
+            here = here.tree_replace(jax.tree.map(jnp.asarray, changed_fields(model, world)))
+
         def substep(state, share):
-            return step(state, before + share * (after - before), speed), None
+            return step(here, state, before + share * (after - before), speed), None
 
         return lax.scan(substep, state, jnp.asarray(shares, before.dtype))[0]
 
     return control_step
 
 
-def _make_step(model: mujoco.MjModel) -> Callable[[RobotState, Array, Array], RobotState]:
-    """Return `mj_step` for (state, set-points, their speeds), put together from the stages of MJX.
+def _make_step(model: mujoco.MjModel) -> Callable[[mjx.Model, RobotState, Array, Array], RobotState]:
+    """Return `mj_step` for (model, state, set-points, their speeds), put together from the stages of MJX.
 
     `mjx.step` has stages that do nothing for a robot with plain servos and nothing else that acts on it, but
     take time: Jacobians of all bodies for forces from outside, and matrices of moments for the actuators.
@@ -66,16 +75,14 @@ def _make_step(model: mujoco.MjModel) -> Callable[[RobotState, Array, Array], Ro
     ):
         if found != expected:
             raise ValueError(f"the {name} must be {expected.name}, got {type(expected)(found).name}")
-    device_model = mjx.put_model(model)
     # Damping is made implicit here, as implicitfast does it; `mjx.euler` then only integrates.
-    explicit = model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    integrator = device_model.tree_replace({"opt.disableflags": explicit})
+    integrates_only = {"opt.disableflags": model.opt.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP}
     # Only what the state holds goes round a loop; the rest of mjx.Data is made anew in each step and
     # costs nothing.
     blank = mjx.make_data(model)
     timestep = float(model.opt.timestep)
 
-    def step(state: RobotState, set_point: Array, speed: Array) -> RobotState:
+    def step(device_model: mjx.Model, state: RobotState, set_point: Array, speed: Array) -> RobotState:
         data = blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
         for stage in _POSITION_STAGES + _VELOCITY_STAGES:
             data = stage(device_model, data)
@@ -88,7 +95,7 @@ def _make_step(model: mujoco.MjModel) -> Callable[[RobotState, Array, Array], Ro
         # implicitfast: the velocity that damps is that of the end of the step.
         damped = inertia + timestep * jnp.diag(damping + device_model.dof_damping)
         qacc = cho_solve(cho_factor(damped, lower=True), qfrc_smooth + data.qfrc_constraint)
-        moved = mjx.euler(integrator, data.replace(qacc=qacc))
+        moved = mjx.euler(device_model.tree_replace(integrates_only), data.replace(qacc=qacc))
         return RobotState(moved.qpos, moved.qvel, data.qacc)
 
     return step

@@ -25,8 +25,11 @@ class RobotState(NamedTuple):
     qacc_warmstart: Float[Array, " nv"]
 
 
-ControlStep = Callable[[RobotState, Array, Array, Array], RobotState]
-"""(state, set-points before, set-points after, their speeds) -> state one control step later."""
+ControlStep = Callable[..., RobotState]
+"""(state, set-points before, set-points after, their speeds) -> state one control step later.
+
+A fifth argument, a `physics.world.World`, takes the place of the model's own world.
+"""
 
 
 def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:

@@ -61,8 +61,8 @@ class Task:
     Attributes:
         sample_context: (key) -> context (s,).
         rollout: (key, context (s,), theta (d,)) -> outcome of one rollout.
-        context_dim: s.
-        theta_dim: d.
+        context_dim: Number s of context variables.
+        theta_dim: Number d of parameters.
         worst_reward: The finite reward put in place of one that is not finite.
     """
 

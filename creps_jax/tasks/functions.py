@@ -40,7 +40,7 @@ def contextual_function(
         ValueError: If `transform` is no finite matrix, or the range is not in order.
 
     Source: Abdolmaleki et al. 2017, Contextual covariance matrix adaptation evolutionary strategies,
-        Section 4.1.
+    Section 4.1.
     """
     checks.function("function", function, "(x) -> number")
     checks.number("low", low)

@@ -1,7 +1,7 @@
 """The walking task: a simulated NAO walks straight ahead, from standstill, at the speed it is asked for."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,14 +12,24 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
-from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, MAX_JOINT_SPEED, NUM_JOINTS
-from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints
-from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, params_from_theta
+from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, NUM_JOINTS
+from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints, stand_upright
+from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, count_steps, params_from_theta
 from creps_jax.motion.walking.posture import Balance
+from creps_jax.motion.walking.set_points import next_set_point
 from creps_jax.physics import mjx
 from creps_jax.physics.state import ControlStep, RobotState, initial_state
+from creps_jax.physics.world import world_of
 from creps_jax.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
 from creps_jax.tasks.base import Task
+from creps_jax.tasks.conditions import (
+    Circumstances,
+    Condition,
+    check_conditions,
+    circumstances_of,
+    slope_angle,
+    upward,
+)
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
 
 __all__ = ["WalkNoise", "WalkOutcome", "WalkRecord", "WalkReward", "load_nao", "nao_walk", "record_walk"]
@@ -30,8 +40,6 @@ _FALLEN_HEIGHT = 0.2
 _FALLEN_COSINE = 0.64
 # All control steps are planned before the first: a longer episode would fill the memory.
 _LONGEST = 3600.0
-# The shortest step the plan has to provide for, see `params_from_theta`.
-_SHORTEST_STEP = 0.08
 
 
 Physics = Callable[[mujoco.MjModel, int], ControlStep]
@@ -106,6 +114,7 @@ class _Walk(NamedTuple):
     poses: BodyPose
     lean_noise: Array
     set_point_noise: Array
+    circumstances: Circumstances | None
 
 
 class _Progress(NamedTuple):
@@ -149,6 +158,7 @@ def nao_walk(
     reward: WalkReward = WalkReward(),
     noise: WalkNoise = WalkNoise(),
     balance: Balance = Balance(),
+    conditions: Sequence[Condition] = (),
     model: mujoco.MjModel | None = None,
     physics: Physics = mjx.make_control_step,
 ) -> Task:
@@ -158,15 +168,18 @@ def nao_walk(
     speed is the displacement of the torso, in the frame of the start, over the time from the end of the
     start-up to the end of the episode. A fall ends the episode, and the speed up to it counts.
 
+    With further conditions, such as the slope of the floor, the context is the speed and the value of each.
+
     Args:
         low: Lowest speed that is asked for, m/s.
         high: Highest speed that is asked for, m/s.
-        sample_context: (key) -> speed (1,); by default Gaussian about the middle, clipped to the range.
+        sample_context: (key) -> context (1 + k,); by default Gaussian about the middle, clipped to the range.
         duration: Length of the episode, s.
         start_up: Length of the time at its start over which the speed does not count, s.
         reward: Weights of the reward.
         noise: Sizes of the noise.
         balance: How steps answer to the measured orientation; by default not at all, as in the paper.
+        conditions: The k conditions that the context tells besides the speed, see `tasks.conditions`.
         model: The robot; by default `load_nao()`.
         physics: What steps the robot: `physics.mjx.make_control_step`, which any device runs, or
             `physics.c.make_control_step`, the host's C MuJoCo.
@@ -175,8 +188,8 @@ def nao_walk(
         The task. Its rollout is for one robot; vmap it for a batch.
 
     Raises:
-        ValueError: If the range or the times are not in order, or the model is not driven by the NAO's
-            joints.
+        ValueError: If the range or the times are not in order, there are two conditions of one name or one
+            that begins after the end, or the model is not driven by the NAO's joints.
 
     Source: Abdolmaleki et al. 2016, Section 4.3.
     """
@@ -191,13 +204,16 @@ def nao_walk(
         raise ValueError(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
         )
-    sample_context = gaussian_contexts(low, high, clip=True) if sample_context is None else sample_context
-    begin, advance = _make_walker(model, duration, noise, balance, physics)
+    check_conditions(conditions, duration)
+    if sample_context is None:
+        lows, highs = [low, *(c.low for c in conditions)], [high, *(c.high for c in conditions)]
+        sample_context = gaussian_contexts(lows, highs, clip=True)
+    begin, advance = _make_walker(model, duration, noise, balance, physics, conditions)
     num_ticks = round(duration / CONTROL_PERIOD)
     start_up_ticks = round(start_up / CONTROL_PERIOD)
 
-    def rollout(key: PRNGKey, context: Float[Array, "1"], theta: Float[Array, "10"]) -> WalkOutcome:
-        walk = begin(key, theta)
+    def rollout(key: PRNGKey, context: Float[Array, " s"], theta: Float[Array, "10"]) -> WalkOutcome:
+        walk = begin(key, theta, context[1:])
         start = _Progress(jnp.int32(0), walk.robot, walk.set_point, walk.robot.qpos[:2], jnp.asarray(False))
 
         def is_walking(progress):
@@ -208,7 +224,8 @@ def nao_walk(
             tick = progress.tick + 1
             is_start_up = tick <= start_up_ticks
             measured_from = lax.select(is_start_up, robot.qpos[:2], progress.measured_from)
-            return _Progress(tick, robot, set_point, measured_from, _has_fallen(robot.qpos))
+            has_fallen = _has_fallen(robot.qpos, walk.circumstances)
+            return _Progress(tick, robot, set_point, measured_from, has_fallen)
 
         end = lax.while_loop(is_walking, step, start)
         measured = jnp.maximum(end.tick - start_up_ticks, 1).astype(theta.dtype) * CONTROL_PERIOD
@@ -220,7 +237,7 @@ def nao_walk(
 
     # A fall at twice the highest speed in the wrong direction.
     worst = -(reward.fall + reward.speed * (3.0 * high) ** 2)
-    return Task(sample_context, rollout, context_dim=1, theta_dim=len(PARAM_NAMES), worst_reward=worst)
+    return Task(sample_context, rollout, 1 + len(conditions), theta_dim=len(PARAM_NAMES), worst_reward=worst)
 
 
 def record_walk(
@@ -230,6 +247,8 @@ def record_walk(
     duration: float = 8.0,
     noise: WalkNoise = WalkNoise(),
     balance: Balance = Balance(),
+    conditions: Sequence[Condition] = (),
+    values: Float[Array, " k"] | None = None,
     model: mujoco.MjModel | None = None,
     physics: Physics = mjx.make_control_step,
 ) -> WalkRecord:
@@ -241,19 +260,24 @@ def record_walk(
         duration: Length of the episode, s.
         noise: Sizes of the noise.
         balance: See `nao_walk`.
+        conditions: See `nao_walk`.
+        values: Value of each condition.
         model: The robot; by default `load_nao()`.
         physics: See `nao_walk`.
 
     Returns:
         The walk.
+
+    Raises:
+        ValueError: If there is not one value for each condition.
     """
-    begin, advance = _make_walker(model, duration, noise, balance, physics)
-    walk = begin(key, theta)
+    begin, advance = _make_walker(model, duration, noise, balance, physics, conditions)
+    walk = begin(key, theta, values)
 
     def step(carry, tick):
         robot, set_point, has_fallen = carry
         robot, set_point = advance(walk, tick, robot, set_point)
-        has_fallen = has_fallen | _has_fallen(robot.qpos)
+        has_fallen = has_fallen | _has_fallen(robot.qpos, walk.circumstances)
         return (robot, set_point, has_fallen), (robot.qpos, set_point, has_fallen)
 
     ticks = jnp.arange(round(duration / CONTROL_PERIOD), dtype=jnp.int32)
@@ -263,42 +287,55 @@ def record_walk(
     )
 
 
-def _make_walker(model, duration, noise, balance, physics):
-    """Return `begin(key, theta)` and `advance(walk, tick, robot, set_point)`, for rollout and record."""
+def _make_walker(model, duration, noise, balance, physics, conditions=()):
+    """Return `begin(key, theta, values)` and `advance(walk, tick, robot, set_point)`."""
     model = load_nao() if model is None else model
     _check_model(model)
     control_step = physics(model, round(CONTROL_PERIOD / model.opt.timestep))
     num_ticks = round(duration / CONTROL_PERIOD)
-    num_steps = round(duration / _SHORTEST_STEP) + 1
 
-    def begin(key: PRNGKey, theta: Array) -> _Walk:
+    def begin(key: PRNGKey, theta: Array, values: Array | None = None) -> _Walk:
         start_key, lean_key, set_point_key = jax.random.split(key, 3)
+        values = jnp.zeros(0, theta.dtype) if values is None else values
+        circumstances = circumstances_of(conditions, values, world_of(model))
         params = params_from_theta(theta)
-        plans = plan_walk(params, num_steps)
-        first = pose_at(params, plans, jnp.zeros_like(params.lean))
+        plans = plan_walk(params, count_steps(duration))
+
+        def planned(time):
+            pose = pose_at(params, plans, time)
+            return pose if circumstances is None else stand_upright(pose, slope_angle(circumstances.world))
+
+        if circumstances is not None:
+            # Plan and measurement are in the frame of the floor: the robot finds the vertical and is told the
+            # slope. A lean counts from the vertical, which itself leans forward from a floor that rises.
+            params = params._replace(lean=params.lean + slope_angle(circumstances.world))
+        first = planned(jnp.zeros_like(params.lean))
         upright = jnp.stack([jnp.zeros_like(params.lean), params.lean, jnp.zeros_like(params.lean)])
         set_point = pose_joints(params, first, upright)
         joints = set_point + noise.start * jax.random.normal(start_key, (NUM_JOINTS,), theta.dtype)
         robot = initial_state(jnp.concatenate([_torso_over(first, params.lean), joints]), model.nv)
         times = jnp.arange(1, num_ticks + 1, dtype=theta.dtype) * CONTROL_PERIOD
-        poses = jax.vmap(lambda time: pose_at(params, plans, time))(times)
+        poses = jax.vmap(planned)(times)
         lean_noise = noise.lean * jax.random.normal(lean_key, (num_ticks, 3), theta.dtype)
         set_point_noise = noise.set_point * jax.random.normal(
             set_point_key, (num_ticks, NUM_JOINTS), theta.dtype
         )
         set_point_noise = jnp.concatenate([jnp.zeros((1, NUM_JOINTS), theta.dtype), set_point_noise])
-        return _Walk(robot, set_point, params, poses, lean_noise, set_point_noise)
+        return _Walk(robot, set_point, params, poses, lean_noise, set_point_noise, circumstances)
 
     def advance(walk: _Walk, tick: Array, robot: RobotState, set_point: Array) -> tuple[RobotState, Array]:
         pose, lean_noise = jax.tree.map(lambda leaf: leaf[tick], (walk.poses, walk.lean_noise))
         measured = quat_to_rpy(robot.qpos[3:7]) + lean_noise
         target = pose_joints(walk.params, pose, measured, balance=balance)
-        slew = MAX_JOINT_SPEED * CONTROL_PERIOD
-        target = set_point + jnp.clip(target - set_point, -slew, slew)
+        target = next_set_point(set_point, target, CONTROL_PERIOD)
         # The servos miss their set-points by the noise; the speed that they are told is the planned one.
         before = set_point + walk.set_point_noise[tick]
         after = target + walk.set_point_noise[tick + 1]
-        return control_step(robot, before, after, (target - set_point) / CONTROL_PERIOD), target
+        speed = (target - set_point) / CONTROL_PERIOD
+        if walk.circumstances is None:
+            return control_step(robot, before, after, speed), target
+        robot = _pushed(robot, tick, walk.circumstances)
+        return control_step(robot, before, after, speed, walk.circumstances.world), target
 
     return begin, advance
 
@@ -311,10 +348,20 @@ def _torso_over(pose: BodyPose, lean: Scalar) -> Array:
     return jnp.concatenate([position, rpy_to_quat(jnp.stack([zero, lean, zero]))])
 
 
-def _has_fallen(qpos: Array) -> Array:
+def _pushed(robot: RobotState, tick: Array, circumstances: Circumstances) -> RobotState:
+    """Return the robot after the push, if there is one and it comes in this control step."""
+    if circumstances.push_time is None:
+        return robot
+    is_now = tick == round(circumstances.push_time / CONTROL_PERIOD)
+    return robot._replace(qvel=robot.qvel.at[1].add(jnp.where(is_now, circumstances.push, 0.0)))
+
+
+def _has_fallen(qpos: Array, circumstances: Circumstances | None) -> Array:
     """Say whether the torso is low or far from upright; a state that is not finite counts as fallen."""
-    stands = (qpos[2] > _FALLEN_HEIGHT) & (quat_to_matrix(qpos[3:7])[2, 2] > _FALLEN_COSINE)
-    return ~stands
+    is_high = qpos[2] > _FALLEN_HEIGHT
+    rotation = quat_to_matrix(qpos[3:7])
+    cosine = rotation[2, 2] if circumstances is None else upward(circumstances.world) @ rotation[:, 2]
+    return ~(is_high & (cosine > _FALLEN_COSINE))
 
 
 def _check_settings(reward: WalkReward, noise: WalkNoise, balance: Balance, physics: Physics) -> None:

@@ -124,7 +124,7 @@ def hole_reaching(
         ValueError: If the range is not in order, or the hole is not one.
 
     Source: Abdolmaleki et al. 2016, Section 4.2; the weights 1e5 and 10, and the length of a step, are those
-        of its author's published settings.
+    of its author's published settings.
     """
     checks.number("low", low)
     checks.number("high", high)

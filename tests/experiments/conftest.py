@@ -1,12 +1,16 @@
 """Make a small experiment known, and compile quickly."""
 
+import dataclasses
 import sys
 import types
 
 import jax
+import jax.numpy as jnp
 import pytest
 
-from experiments import registry
+from creps_jax.archive import push
+from creps_jax.creps import CrepsState, creps
+from experiments import comparison, registry, walk
 from tests.experiments import tiny as small
 
 
@@ -16,6 +20,26 @@ def compiled_quickly():
     jax.config.update("jax_disable_most_optimizations", True)
     yield
     jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
+def simple_updates(monkeypatch):
+    """Let experiments take any new mean for an update: the real one takes seconds to compile, each time."""
+
+    def make(*features, **settings):
+        algorithm = creps(*features, **settings)
+
+        def tell(state, batch):
+            _, info = jax.eval_shape(algorithm.tell, state, batch)
+            info = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), info)
+            best = batch.theta[jnp.argmax(batch.reward)]
+            policy = state.policy._replace(coef=0.9 * state.policy.coef + 0.1 * best[None])
+            return CrepsState(policy, push(state.archive, batch), state.iteration + 1, state.history), info
+
+        return dataclasses.replace(algorithm, tell=tell)
+
+    for module in (comparison, walk):
+        monkeypatch.setattr(module, "creps", make)
 
 
 @pytest.fixture

@@ -72,6 +72,18 @@ def test_a_home_that_cannot_be_written_costs_only_the_cache(tmp_path):
             "error: --trials does not go with --speed",
         ),
         (["run", "walk", "--policy", "x.npz"], 2, "", "error: --policy goes with --speed"),
+        (["export", "--to", "x.onx"], 2, "", "error: --to must end in .onnx, .h, .csv, .npz, got x.onx"),
+        (["export", "--to", "x"], 2, "", "error: --to must end in"),
+        (["export", "--to", "x.csv"], 2, "", "error: x.csv would hold the joint set-points of a walk"),
+        (["export", "--to", "x.h", "--speed", "0.3"], 2, "", "error: --speed goes with .csv and .npz: x.h"),
+        (["export", "--to", "x.h", "--duration", "8"], 2, "", "error: --duration goes with .csv and .npz"),
+        (["session", "tell", "--help"], 0, "The measurement failed", ""),
+        (
+            ["session", "tell", "nowhere", "1", "--reward", "-2"],
+            2,
+            "",
+            "error: nowhere holds no robot session",
+        ),
     ],
 )
 def test_help_and_mistakes_are_answered_without_starting_jax(tmp_path, arguments, code, out, error):

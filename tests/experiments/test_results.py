@@ -2,6 +2,7 @@ import dataclasses
 import errno
 import json
 import os
+import stat
 
 import numpy as np
 import pytest
@@ -44,6 +45,37 @@ def test_a_full_disk_leaves_the_earlier_file_whole_and_nothing_else(tmp_path, mo
     np.testing.assert_array_equal(results.load_arrays(path)["a"], np.ones(3))
 
 
+def test_a_file_is_on_the_disk_before_its_name_is_and_then_the_folder(tmp_path, monkeypatch):
+    done = []
+    fsync, replace = os.fsync, os.replace
+
+    def note_fsync(handle):
+        done.append("folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file")
+        fsync(handle)
+
+    def note_replace(*paths):
+        done.append("name")
+        replace(*paths)
+
+    monkeypatch.setattr(os, "fsync", note_fsync)
+    monkeypatch.setattr(os, "replace", note_replace)
+    results.save_text(tmp_path / "file", "hello")
+    assert done == ["file", "name", "folder"]
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.EINVAL])
+def test_a_folder_that_cannot_be_synced_is_named_where_it_could_be(tmp_path, monkeypatch, code):
+    def fail(_):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    if code == errno.EINVAL:
+        results.sync_folder(tmp_path)
+    else:
+        with pytest.raises(UserError, match=r"may not last a loss of power: Input/output error"):
+            results.sync_folder(tmp_path)
+
+
 def test_a_writer_that_fails_leaves_no_trace(tmp_path):
     def fail(file):
         file.write(b"half")
@@ -74,6 +106,25 @@ def test_files_that_are_no_arrays_get_one_clear_error(tmp_path, spoil):
     with pytest.raises(UserError, match=r"arrays\.npz") as caught:
         results.load_arrays(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (None, "cannot read .*: No such file"),
+        (b"", "cut short, or no JSON"),
+        (b'{"a": 1', "cut short, or no JSON"),
+        (b"\xff\xfe", "cut short, or no JSON"),
+        (b'{"a": {"b": 1, "c": 2, "b": 3}}', "the field 'b' is there twice"),
+    ],
+)
+def test_files_that_are_no_json_get_one_clear_error(tmp_path, content, error):
+    path = tmp_path / "file.json"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(UserError, match=error) as caught:
+        results.load_json(path)
+    assert "file.json" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_new_folders_never_take_one_that_is_there(tmp_path):

@@ -43,6 +43,10 @@ def test_tables_have_the_same_cells_in_both_forms():
     lines = tables.to_markdown(columns).splitlines()
     assert [cell.strip() for cell in lines[3].strip("|").split("|")] == ["bc", "-12.346"]
     assert len({len(line) for line in lines}) == 1
+    assert tables.to_markdown({"name": [], "value": []}).splitlines() == [
+        "| name | value |",
+        "|-----:|------:|",
+    ]
 
 
 def test_interval_holds_the_mean_and_stays_among_the_samples():

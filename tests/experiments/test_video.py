@@ -1,8 +1,10 @@
+import types
+
 import numpy as np
 import pytest
 
 from experiments.errors import UserError
-from experiments.video import Clip, VideoError, layout, write_video
+from experiments.video import Clip, VideoError, _tilt, layout, write_video
 
 BOX = """
 <mujoco>
@@ -28,10 +30,19 @@ def model(tmp_path):
     return path
 
 
+def test_a_floor_that_rises_ahead_is_drawn_so():
+    turned = {"geom_xpos": np.array([[1.0, 2.0, 0.0]]), "geom_xmat": np.eye(3).reshape(1, 9)}
+    rotation = _tilt(types.SimpleNamespace(**turned), 30.0)
+    np.testing.assert_allclose(turned["geom_xpos"], [[np.cos(np.pi / 6), 2.0, 0.5]])
+    np.testing.assert_allclose(turned["geom_xmat"].reshape(3, 3), rotation)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
 def test_a_video_and_a_still_are_written_where_there_is_opengl(tmp_path, model):
     path = tmp_path / "new" / "walk.mp4"
     try:
-        write_video(path, model, [make_clip(), make_clip("shorter", 4)], still_at=0.1)
+        clips = [make_clip(), make_clip("shorter", 4), make_clip()._replace(slope=5.0)]
+        write_video(path, model, clips, still_at=0.1)
     except VideoError as error:
         pytest.skip(str(error))
     assert path.read_bytes()[4:8] == b"ftyp"

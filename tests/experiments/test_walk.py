@@ -78,6 +78,7 @@ def test_the_result_folder_is_complete(bench):
     assert said[-1] == "video: results/walk/walk-0.30.mp4"
 
 
+@pytest.mark.usefixtures("simple_updates")
 def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
     settings = dataclasses.replace(walk.SETTINGS["quick"], mean_kl_bound=0.5, cov_kl_bound=0.05)
     key = jax.random.key(0)

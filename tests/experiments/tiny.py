@@ -1,6 +1,7 @@
 """A small experiment to run, with everything that a real one has.
 
-As a program it is the command line with this one experiment, which saves every iteration.
+As a program it is the command line with this one experiment, which saves every iteration and runs on all
+devices.
 """
 
 import dataclasses
@@ -38,7 +39,7 @@ def run(settings, key, session):
     plan = Plan(settings.iterations, samples=10)
     start = LinearGaussian(jnp.zeros((2, 1)), jnp.eye(1))
     keys = trial_keys(key, settings.trials)
-    devices = jax.local_devices()[:1]
+    devices = None if __name__ == "__main__" else jax.local_devices()[:1]
     _, log = learn(keys, TASK, ALGORITHM, start, plan, session=session, name="tiny", devices=devices)
     return {"reward": log["mean_reward"], "coef": log["coef"]}
 

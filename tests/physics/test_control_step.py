@@ -1,5 +1,7 @@
 """Either physics steps the robot as a plain loop around C MuJoCo does."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -8,6 +10,7 @@ import pytest
 
 from creps_jax.physics import c, mjx
 from creps_jax.physics.state import initial_state
+from creps_jax.physics.world import World
 from creps_jax.tasks.nao_walk import load_nao
 from tests.oracles.walk_c import servo_step
 
@@ -24,33 +27,95 @@ def model():
     return load_nao()
 
 
-@pytest.mark.usefixtures("relaxed_promotion")
-@pytest.mark.parametrize(("change", "saturates"), [(0.02, False), (0.12, True)])
-def test_one_control_step_equals_c(make_control_step, change, saturates):
-    rng = np.random.default_rng(0)
+NUM = 8
+
+
+@pytest.fixture(scope="module")
+def exact_model():
     # Enough iterations for both to converge: what is compared is the physics, not the rounding of the solver.
     model = load_nao()
     model.opt.iterations, model.opt.ls_iterations = 30, 30
-    control_step = jax.jit(jax.vmap(make_control_step(model, 5)))
-    num = 8
-    qpos = np.tile(model.key("stand").qpos, (num, 1))
-    qpos[:, 2] += rng.uniform(0.0, 0.003, num)
-    qpos[:, 7:] += 0.02 * rng.standard_normal((num, model.nu))
+    return model
+
+
+@pytest.fixture(scope="module", params=PHYSICS)
+def control_step(request, exact_model):
+    return jax.jit(jax.vmap(PHYSICS[request.param](exact_model, 5)))
+
+
+def starts(model, change):
+    """Return positions (n, nq), and set-points before and after and their speeds (n, nu)."""
+    rng = np.random.default_rng(0)
+    qpos = np.tile(model.key("stand").qpos, (NUM, 1))
+    qpos[:, 2] += rng.uniform(0.0, 0.003, NUM)
+    qpos[:, 7:] += 0.02 * rng.standard_normal((NUM, model.nu))
     before = qpos[:, 7:].copy()
     after = before + change * rng.standard_normal(before.shape)
-    speed = (after - before) / 0.02
+    return qpos, (before, after, (after - before) / 0.02)
+
+
+def stepped(control_step, model, qpos, commands, *world):
     states = jax.vmap(lambda q: initial_state(q, model.nv))(jnp.asarray(qpos, jnp.float32))
-    ours = control_step(states, *(jnp.asarray(x, jnp.float32) for x in (before, after, speed)))
+    return control_step(states, *(jnp.asarray(x, jnp.float32) for x in commands), *world)
+
+
+def stepped_by_c(model, qpos, commands):
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    servo_step(model, data, *commands)
+    return data
+
+
+@pytest.mark.usefixtures("relaxed_promotion")
+@pytest.mark.parametrize(("change", "saturates"), [(0.02, False), (0.12, True)])
+def test_one_control_step_equals_c(control_step, exact_model, change, saturates):
+    qpos, commands = starts(exact_model, change)
+    ours = stepped(control_step, exact_model, qpos, commands)
     saturated = 0
-    for i in range(num):
-        data = mujoco.MjData(model)
-        data.qpos[:] = qpos[i]
-        servo_step(model, data, before[i], after[i], speed[i])
+    for i in range(NUM):
+        data = stepped_by_c(exact_model, qpos[i], [x[i] for x in commands])
         np.testing.assert_allclose(ours.qpos[i], data.qpos, atol=2e-6)
         np.testing.assert_allclose(ours.qvel[i], data.qvel, atol=2e-4)
-        saturated += np.sum(np.abs(data.actuator_force) >= model.actuator_forcerange[:, 1])
+        saturated += np.sum(np.abs(data.actuator_force) >= exact_model.actuator_forcerange[:, 1])
     # A torque at its limit is left out of the implicit step.
     assert (saturated > 0) == saturates
+
+
+@pytest.mark.usefixtures("relaxed_promotion")
+def test_a_control_step_in_a_world_of_its_own_equals_c_with_another_model(control_step, exact_model):
+    rng = np.random.default_rng(1)
+    qpos, commands = starts(exact_model, 0.06)
+    gravity = np.array([-2.0, 1.0, -9.0]) + rng.uniform(-1.0, 1.0, (NUM, 3))
+    payload, friction = rng.uniform(0.5, 2.0, NUM), rng.uniform(0.1, 0.3, NUM)
+    world = World(*(jnp.asarray(x, jnp.float32) for x in (gravity, payload, friction)))
+    ours = stepped(control_step, exact_model, qpos, commands, world)
+
+    def there(i, changes):
+        model = copy.copy(exact_model)
+        if "gravity" in changes:
+            model.opt.gravity[:] = gravity[i]
+        if "payload" in changes:
+            model.body("torso").mass += payload[i]
+        if "friction" in changes:
+            model.geom_friction[:, 0] *= friction[i]
+        return stepped_by_c(model, qpos[i], [x[i] for x in commands])
+
+    names = {"gravity", "payload", "friction"}
+    for i in range(NUM):
+        data = there(i, names)
+        np.testing.assert_allclose(ours.qpos[i], data.qpos, atol=1e-5)
+        np.testing.assert_allclose(ours.qvel[i], data.qvel, atol=1e-3)
+    # Each of the three counts.
+    for name in names:
+        assert np.abs(there(0, names - {name}).qvel - there(0, names).qvel).max() > 0.02, name
+
+
+@pytest.mark.usefixtures("relaxed_promotion")
+def test_numbers_of_a_world_may_stay_plain(make_control_step, model):
+    control_step = make_control_step(model, 5)
+    state, joints = initial_state(jnp.zeros(model.nq), model.nv), jnp.zeros(model.nu)
+    moved = jax.eval_shape(lambda g: control_step(state, joints, joints, joints, World(g)), jnp.zeros(3))
+    assert moved.qpos.shape == (model.nq,)
 
 
 def test_no_substep_is_an_error(make_control_step, model):

@@ -8,7 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from creps_jax.motion.walking.params import params_from_theta
 from creps_jax.motion.walking.posture import Balance
+from creps_jax.motion.walking.set_points import open_loop_set_points
 from creps_jax.physics import c, mjx
 from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, _make_walker, load_nao, nao_walk, record_walk
 from creps_jax.train import evaluate
@@ -89,6 +91,20 @@ def test_a_record_is_the_same_walk_with_the_speed_of_the_displacement(outcome):
     displacement = np.asarray(record.qpos[-1, :2] - record.qpos[start, :2])
     np.testing.assert_allclose(displacement / (DURATION - 2.0), outcome.speed[1, 0], atol=0.02)
     assert not record.has_fallen.any()
+
+
+def test_set_points_of_a_trunk_that_leans_as_intended_are_the_open_loop_ones():
+    def stay(model, num_substeps):
+        return lambda robot, before, after, speed: robot
+
+    def walk(key, theta):
+        quiet = WalkNoise(0.0, 0.0, 0.0)
+        record = record_walk(key, theta, duration=2.0, noise=quiet, balance=BALANCE, physics=stay)
+        return record.set_point, open_loop_set_points(params_from_theta(theta), duration=2.0, period=0.02)
+
+    recorded, planned = jax.jit(walk)(jax.random.key(0), jnp.array(MIDDLE))
+    assert jnp.abs(jnp.diff(planned, axis=0)).max() > 0.01
+    np.testing.assert_allclose(planned[1:], recorded, atol=2e-6)
 
 
 @pytest.mark.usefixtures("relaxed_promotion")

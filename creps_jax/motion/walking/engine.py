@@ -27,6 +27,7 @@ __all__ = [
     "plan_walk",
     "pose_at",
     "pose_joints",
+    "stand_upright",
 ]
 
 NUM_NODES = 33
@@ -163,6 +164,20 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
         right=jnp.where(supports_left, swing, support),
         turn=jnp.where(supports_left, 0.5 - swung, swung - 0.5),
     )
+
+
+def stand_upright(pose: BodyPose, slope: Scalar) -> BodyPose:
+    """Move the hips of a pose to where they stand above the feet as gravity has it.
+
+    Args:
+        pose: A pose planned for level ground, in the frame of the floor.
+        slope: Angle by which the floor rises along x, rad.
+
+    Returns:
+        The pose with the hips farther ahead, by what their height makes of the slope.
+    """
+    ahead = pose.hips[2] * jnp.tan(slope)
+    return pose._replace(hips=pose.hips.at[0].add(ahead))
 
 
 def _above_floor(foot, height):

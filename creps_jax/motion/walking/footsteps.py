@@ -9,8 +9,9 @@ from creps_jax.typing import Array, Bool, Float, Scalar
 
 __all__ = ["FOOT_SPACING", "Footstep", "Stance", "next_footstep", "standing"]
 
-# Distance of the two feet when standing: that of the hips (SimSpark NAO type 0), m.
 FOOT_SPACING = 0.11
+"""Distance of the two feet when standing: that of the hips (SimSpark NAO type 0), m."""
+
 # Where the swing foot may land, seen from the support foot: forward, sideways on its own side (reach and
 # collision), turned; m and rad. The body stays within half of that box.
 _LANDING_LOW = (-0.20, 0.10, -0.6)

@@ -16,12 +16,13 @@ __all__ = [
     "PARAM_NAMES",
     "PARAM_UNITS",
     "WalkParams",
+    "count_steps",
     "params_from_theta",
 ]
 
 GRAVITY = 9.81
+"""Acceleration of gravity, m/s^2."""
 
-# The paper's order (Table 1); the names are the fields of WalkParams.
 PARAM_NAMES = (
     "amplitude",
     "hip_height",
@@ -34,6 +35,8 @@ PARAM_NAMES = (
     "double_support",
     "step_growth",
 )
+"""Names of the parameters, the fields of `WalkParams`, in the paper's order (Table 1)."""
+
 PARAM_LABELS = (
     "A",
     "x0",
@@ -46,22 +49,27 @@ PARAM_LABELS = (
     "phi_DSP",
     "sigma_step",
 )
-PARAM_UNITS = ("m", "m", "m", "s", "deg", "", "", "m", "s", "m/s")
+"""The paper's symbols for the parameters."""
 
-# Section 4.3.1, as printed: (lower, upper).
+PARAM_UNITS = ("m", "m", "m", "s", "deg", "", "", "m", "s", "m/s")
+"""Units of the parameters in theta; gains have none."""
+
 PAPER_BOUNDS = (
     (0.0, 0.16, 0.02, 0.1, 0.0, 0.0, 0.0, 0.05, 0.0, 0.0),
     (1.0, 0.22, 0.15, 3.0, 5.0, 1.0, 1.0, 0.5, 1.0, 0.5),
 )
-# The part of that box in which a NAO can walk at all, with room for slow walking (step length from 0) and
-# leaning back.
+"""Lower and upper bounds of theta, as the paper prints them (Section 4.3.1)."""
+
 NAO_BOUNDS = (
     (0.0, 0.15, 0.02, 0.14, -5.0, 0.0, 0.0, 0.0, 0.0, 0.02),
     (0.01, 0.20, 0.06, 0.40, 5.0, 1.0, 1.0, 0.15, 0.1, 0.2),
 )
+"""Bounds in which a NAO can walk at all: part of `PAPER_BOUNDS`, with room for slow walking (step length from
+0) and leaning back."""
 
+_SHORTEST_STEP = 0.08
 # What the engine accepts, whatever theta says. Within it every plan is finite.
-_SAFE_LOW = (0.0, 0.10, 0.0, 0.08, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
+_SAFE_LOW = (0.0, 0.10, 0.0, _SHORTEST_STEP, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
 _SAFE_HIGH = (1.0, 0.22, 0.15, 4.0, 30.0, 2.0, 2.0, 0.2, 4.0, 10.0)
 # Amplitude at which the spring's acceleration would reach that of gravity is A = g T^2 / (4 pi^2): there
 # the ZMP equation is singular. Share of it that is allowed.
@@ -127,3 +135,12 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
         lean=params.lean * (math.pi / 180.0),
         double_support=jnp.minimum(params.double_support, _MAX_DOUBLE_SUPPORT_SHARE * duration),
     )
+
+
+def count_steps(duration: float) -> int:
+    """Return how many steps at most a walk can have, with any parameters of `params_from_theta`.
+
+    Args:
+        duration: Length of the walk, s.
+    """
+    return round(duration / _SHORTEST_STEP) + 1

@@ -1,0 +1,81 @@
+"""Take a policy away: write it, or a walk that it makes, for use without this project."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from experiments.errors import UserError
+from experiments.process import import_mjx_quietly
+
+_OF_POLICY = {".onnx": "ONNX model", ".h": "C header"}
+_OF_WALK = {".csv": "CSV table", ".npz": "NumPy arrays"}
+_DURATION = 8.0
+
+
+def export(
+    to: Path,
+    policy: Path | None,
+    *,
+    speed: float | None,
+    duration: float | None,
+    say: Callable[[str], None],
+) -> None:
+    """Write a policy as .onnx or .h (C), or the joint set-points of one of its walks as .csv or .npz.
+
+    Args:
+        to: the file; its ending says what it shall be. One that is there is overwritten.
+        policy: policy file; None is the latest learned walking policy, or else the shipped one.
+        speed: speed of the walk, m/s; only for a walk, which needs it.
+        duration: length of the walk, s; only for a walk, 8 by default.
+        say: told one line at a time.
+
+    Raises:
+        UserError: for a mistake in the request, an unreadable policy, or a file that cannot be written.
+    """
+    ending = to.suffix.lower()
+    _check_request(to, ending, speed, duration)
+    # Everything else is imported late: it takes seconds, and mistakes are answered at once.
+    path = policy or _default_policy()
+    if _are_the_same(to, path):
+        raise UserError(f"--to {to} is the policy file itself, name another file")
+    if speed is not None:
+        import_mjx_quietly()
+        from experiments.export import trajectory
+
+        walk = trajectory.plan(path, speed, _DURATION if duration is None else duration)
+        {".csv": trajectory.save_csv, ".npz": trajectory.save_npz}[ending](to, walk)
+    else:
+        from experiments.export import c_header, onnx_model
+        from experiments.policy_file import load_policy
+
+        {".onnx": onnx_model.save, ".h": c_header.save}[ending](to, load_policy(path))
+    say(f"policy: {path}")
+    say(f"{(_OF_POLICY | _OF_WALK)[ending]}: {to}")
+
+
+def _check_request(to: Path, ending: str, speed: float | None, duration: float | None) -> None:
+    """Refuse an unknown ending, and options that do not go with it."""
+    if ending in _OF_WALK:
+        if speed is None:
+            raise UserError(f"{to} would hold the joint set-points of a walk, which need --speed, in m/s")
+    elif ending in _OF_POLICY:
+        for name, value in (("speed", speed), ("duration", duration)):
+            if value is not None:
+                raise UserError(
+                    f"--{name} goes with {' and '.join(_OF_WALK)}: {to} is the policy, for every context"
+                )
+    else:
+        raise UserError(f"--to must end in {', '.join(_OF_POLICY | _OF_WALK)}, got {to}")
+
+
+def _are_the_same(path: Path, other: Path) -> bool:
+    try:
+        return path.samefile(other)
+    except OSError:
+        return False
+
+
+def _default_policy() -> Path:
+    import_mjx_quietly()
+    from experiments.walking_policy import default_policy
+
+    return default_policy()

@@ -1,0 +1,103 @@
+"""Hold the C code that a policy is written as; `c_header` fills it in."""
+
+from string import Template
+
+HEADER = Template("""\
+/* Parameters for a context, by a policy that was learned with creps_jax $version.
+ *
+ *     float context[${PREFIX}_NUM_CONTEXTS] = {$example};
+ *     float parameters[${PREFIX}_NUM_PARAMETERS];
+ *     int is_in_range = ${prefix}_policy(context, parameters);
+ *     ... parameters[$first] ...
+ *
+ * C99 or C++. Needs expf of <math.h>; allocates nothing. To tell NaN, compile without -ffast-math.
+ */
+#ifndef ${PREFIX}_POLICY_H
+#define ${PREFIX}_POLICY_H
+
+#include <math.h>
+
+#define ${PREFIX}_NUM_CONTEXTS $num_contexts
+#define ${PREFIX}_NUM_PARAMETERS $num_params
+#define ${PREFIX}_NUM_FEATURES $num_features
+
+$tables
+/* Compute the parameters for a context$held.
+ *
+ * Returns 1 if the context is within the range that was learned, ${prefix}_context_low to
+ * ${prefix}_context_high. Returns 0 if a context variable is outside: it is then clamped to the range,
+ * NaN to its lower end.
+ */
+static inline int ${prefix}_policy(
+    const float context[${PREFIX}_NUM_CONTEXTS], float parameters[${PREFIX}_NUM_PARAMETERS])
+{
+    float nearest[${PREFIX}_NUM_CONTEXTS];
+    float features[${PREFIX}_NUM_FEATURES];
+    int is_in_range = 1;
+    int i, j;
+
+    for (i = 0; i < ${PREFIX}_NUM_CONTEXTS; ++i) {
+        nearest[i] = context[i];
+        if (!(context[i] >= ${prefix}_context_low[i])) { /* less, or NaN */
+            nearest[i] = ${prefix}_context_low[i];
+            is_in_range = 0;
+        } else if (context[i] > ${prefix}_context_high[i]) {
+            nearest[i] = ${prefix}_context_high[i];
+            is_in_range = 0;
+        }
+    }
+
+$compute_features
+    for (j = 0; j < ${PREFIX}_NUM_PARAMETERS; ++j) {
+        float value = 0.0f;
+        for (i = 0; i < ${PREFIX}_NUM_FEATURES; ++i) {
+            value += features[i] * ${prefix}_coef[i][j];
+        }
+$hold_bounds        parameters[j] = value;
+    }
+    return is_in_range;
+}
+
+#endif
+""")
+
+LINEAR = """\
+    features[0] = 1.0f;
+    for (i = 0; i < ${PREFIX}_NUM_CONTEXTS; ++i) {
+        features[i + 1] = nearest[i];
+    }
+"""
+
+# The largest exponent is taken from all of them, so that the weights cannot all vanish.
+RBF = """\
+    float largest = 0.0f, sum = 0.0f;
+    for (i = 0; i < ${PREFIX}_NUM_FEATURES; ++i) {
+        features[i] = 0.0f;
+        for (j = 0; j < ${PREFIX}_NUM_CONTEXTS; ++j) {
+            const float distance = (nearest[j] - ${prefix}_centers[i][j]) / ${prefix}_widths[j];
+            features[i] -= 0.5f * distance * distance;
+        }
+        if (i == 0 || features[i] > largest) {
+            largest = features[i];
+        }
+    }
+    for (i = 0; i < ${PREFIX}_NUM_FEATURES; ++i) {
+        features[i] = expf(features[i] - largest);
+        sum += features[i];
+    }
+    for (i = 0; i < ${PREFIX}_NUM_FEATURES; ++i) {
+        features[i] /= sum;
+    }
+"""
+
+_BOUNDS = """\
+        const float low = ${prefix}_parameter_low[j], high = ${prefix}_parameter_high[j];
+"""
+_SQUASH = """\
+        value = low + (high - low) / (1.0f + expf(-value));
+"""
+_CLIP = """\
+        value = value < low ? low : value > high ? high : value;
+"""
+# After a sigmoid the clip takes back the last bit that rounding can put outside the box.
+HOLD_BOUNDS = {"none": "", "penalty": _BOUNDS + _CLIP, "sigmoid": _BOUNDS + _SQUASH + _CLIP}

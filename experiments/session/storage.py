@@ -1,0 +1,139 @@
+"""Keep a session in a folder that is whole at any moment, used by one process at a time."""
+
+import contextlib
+import dataclasses
+import fcntl
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TextIO
+
+from experiments import results
+from experiments.errors import UserError
+from experiments.session import plain
+from experiments.session.settings import Settings, load_settings
+from experiments.session.trials import FORMAT, Record
+
+SETTINGS = "settings.json"
+TRIALS = "trials.json"
+_LOCK = ".lock"
+_PAUSE = 0.05
+
+
+def create(folder: Path, settings: Settings) -> None:
+    """Make the folder of a new session: all of it, or nothing.
+
+    Raises:
+        UserError: if the folder is there already, or cannot be written.
+    """
+    if folder.exists():
+        raise UserError(f"{folder} is there already, name a new folder")
+    temporary: Path | None = None
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        results.save_text(temporary / SETTINGS, plain.to_text(dataclasses.asdict(settings)) + "\n")
+        save_record(temporary, Record(settings=settings.digest()))
+        (temporary / _LOCK).touch()
+        temporary.chmod(0o777 & ~results.umask())
+        temporary.rename(folder)
+        temporary = None
+    except OSError as error:
+        raise UserError(f"cannot make {folder}: {error.strerror or error}") from error
+    finally:
+        if temporary is not None:
+            shutil.rmtree(temporary, ignore_errors=True)
+    results.sync_folder(folder.parent)
+
+
+def open_settings(folder: Path) -> Settings:
+    """Read the settings of a session.
+
+    Raises:
+        UserError: if the folder holds none.
+    """
+    if not (folder / SETTINGS).exists():
+        raise UserError(f"{folder} holds no robot session: it has no {SETTINGS} (session new makes one)")
+    return load_settings(folder / SETTINGS)
+
+
+def load_record(folder: Path, settings: Settings) -> Record:
+    """Read the trials of a session; the file is left as it is, whatever comes.
+
+    Raises:
+        UserError: if it is missing, cut short, foreign, or was written with other settings.
+    """
+    path = folder / TRIALS
+    values = results.load_json(path)
+    if not isinstance(values, dict) or values.get("format") != FORMAT:
+        raise UserError(f"{path} holds no trials of a robot session (its format is not {FORMAT!r})")
+    record = plain.read(Record, values, path)
+    if not record.trials:
+        # Until the first trial settings may be edited by hand.
+        return dataclasses.replace(record, settings=settings.digest())
+    if record.settings != settings.digest():
+        raise UserError(
+            f"{folder / SETTINGS} is not what the trials were asked for with: put back what was changed, "
+            "or begin a new session"
+        )
+    wanted = settings.context_names, settings.parameter_names, len(settings.parameters)
+    for trial in record.trials:
+        if (tuple(trial.context), tuple(trial.parameters), len(trial.theta)) != wanted:
+            raise UserError(f"{path}: trial {trial.id} has other variables than {SETTINGS}")
+    return record
+
+
+def save_record(folder: Path, record: Record) -> None:
+    """Write the trials of a session, atomically.
+
+    Raises:
+        UserError: if they cannot be written; those that were there stay.
+    """
+    results.save_text(folder / TRIALS, plain.to_text(dataclasses.asdict(record)) + "\n")
+
+
+@contextlib.contextmanager
+def locked(folder: Path, *, wait: float) -> Iterator[None]:
+    """Keep other processes from changing a session meanwhile.
+
+    Args:
+        folder: that of the session.
+        wait: seconds to wait for others.
+
+    Raises:
+        UserError: if another process is still at it then, or the folder cannot be locked.
+    """
+    handle = _acquire(folder, wait)
+    try:
+        yield
+    finally:
+        handle.close()
+
+
+def _acquire(folder: Path, wait: float) -> TextIO:
+    """Return the open file that holds the lock until it is closed; a process that dies closes it."""
+    deadline = time.monotonic() + wait
+    with contextlib.ExitStack() as stack:
+        try:
+            handle = stack.enter_context((folder / _LOCK).open("a"))
+            while not _try_lock(handle):
+                if time.monotonic() >= deadline:
+                    raise UserError(f"{folder} is in use by another process, try again when it is done")
+                time.sleep(_PAUSE)
+            # A process that was killed while it wrote leaves what nobody reads.
+            for leftover in folder.glob(f".{TRIALS}.*.part"):
+                leftover.unlink(missing_ok=True)
+        except OSError as error:
+            raise UserError(f"cannot lock {folder}: {error.strerror or error}") from error
+        stack.pop_all()
+        return handle
+
+
+def _try_lock(handle: TextIO) -> bool:
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True

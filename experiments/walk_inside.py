@@ -1,0 +1,256 @@
+"""Look inside a walk that stays up and one that falls: what is planned, and what the robot does."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from creps_jax.motion.nao_geometry import JOINT_NAMES
+from creps_jax.motion.walking.engine import plan_walk
+from creps_jax.motion.walking.params import params_from_theta
+from creps_jax.motion.walking.posture import Balance
+from creps_jax.motion.walking.zmp import zmp_reference
+from creps_jax.rotations import quat_to_rpy
+from creps_jax.tasks.nao_walk import WalkNoise, record_walk
+from experiments import plots
+from experiments.errors import UserError
+from experiments.learning import Session
+from experiments.policy_file import policies_folder
+from experiments.probe import Measured, Probe
+from experiments.registry import Claim
+from experiments.tables import save_table
+from experiments.walking_policy import balance_of, load_walking_policy
+
+GAITS = {"good": "steps answer to the tilt", "bad": "the same gait, but they do not"}
+KNEE = JOINT_NAMES.index("left_knee")
+WINDOW = 1.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Settings of the experiment.
+
+    Attributes:
+        speed: asked speed, m/s.
+        noise: how many times the usual noise.
+        duration: length of an episode, s.
+        candidates: seeds among which one is looked for, with which the bad gait falls and the good does not.
+    """
+
+    speed: float = 0.6
+    noise: float = 1.6
+    duration: float = 8.0
+    candidates: int = 64
+
+
+SETTINGS = {"quick": Settings()}
+
+
+def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
+    """Walk with the shipped policy, with its foot placement and without, in the same noise.
+
+    Returns:
+        For each GAIT `GAIT.FIELD` of `Measured` until it falls, and `GAIT.zmp_plan` and `GAIT.com_plan`: the
+        lateral plan at the same times, from the middle of the feet, m.
+
+    Raises:
+        UserError: if no seed among the candidates makes the bad gait fall and the good one not.
+    """
+    del session
+    saved = load_walking_policy(policies_folder() / "walk.npz")
+    theta = jnp.asarray(saved.theta(settings.speed))
+    balances = {"good": balance_of(saved), "bad": balance_of(saved)._replace(placement_gain=0.0)}
+    walkers = {name: _Walker(settings, balance) for name, balance in balances.items()}
+    for candidate in jax.random.split(key, settings.candidates):
+        bad = walkers["bad"](candidate, theta)
+        if bad.fell and not (good := walkers["good"](candidate, theta)).fell:
+            break
+    else:
+        raise UserError(
+            f"no seed of {settings.candidates} tells the gaits apart; take more candidates, or more noise"
+        )
+    arrays = {}
+    for name, walk in {"good": good, "bad": bad}.items():
+        fields = walk.upright._asdict() | _plan(theta, walk.upright.time)
+        arrays |= {f"{name}.{field}": values for field, values in fields.items()}
+    return arrays
+
+
+class _Walked(NamedTuple):
+    """A walk, as far as the robot stayed upright."""
+
+    upright: Measured
+    fell: bool
+
+
+class _Walker:
+    """Walk again and again with the same compiled program, and measure."""
+
+    def __init__(self, settings: Settings, balance: Balance):
+        self._probe = Probe()
+        noise = WalkNoise().times(settings.noise)
+        physics = self._probe.make_control_step
+        self._record = jax.jit(
+            partial(record_walk, duration=settings.duration, noise=noise, balance=balance, physics=physics)
+        )
+
+    def __call__(self, key: jax.Array, theta: jax.Array) -> _Walked:
+        has_fallen = np.asarray(self._record(key, theta).has_fallen)
+        measured = self._probe.take()
+        ticks = int(np.sum(~has_fallen)) * (len(measured.time) // len(has_fallen))
+        return _Walked(Measured(*(field[:ticks] for field in measured)), bool(has_fallen[-1]))
+
+
+def _plan(theta: jax.Array, times: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the lateral plan of the paper's engine at some times."""
+    params = params_from_theta(theta)
+    duration = float(params.step_duration)
+    plans = jax.tree.map(
+        np.asarray, jax.jit(plan_walk, static_argnums=1)(params, int(times[-1] / duration) + 2)
+    )
+    index, phase = (times // duration).astype(int), times / duration % 1.0
+    step = plans.footstep
+    start, end = 0.5 * (step.support + step.swing_start), 0.5 * (step.support + step.swing_end)
+    share = params.double_support / params.step_duration
+    reference = jax.jit(jax.vmap(lambda t, a, b, c: zmp_reference(t[None], a, b, c, share)[0]))
+    zmp = reference(*(jnp.float32(x) for x in (phase, *(x[index, :2] for x in (start, step.support, end)))))
+    nodes = np.linspace(0.0, 1.0, plans.com.shape[1])
+    com = np.array([np.interp(p, nodes, plans.com[i, :, 1]) for i, p in zip(index, phase, strict=True)])
+    middle = np.where(phase < 0.5, start[index, 1], end[index, 1])
+    return {"zmp_plan": np.asarray(zmp)[:, 1] - middle, "com_plan": com - middle}
+
+
+def inside(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
+    """Return what is drawn and tabled of a gait: arrays by name, the numbers in them finite."""
+    get = lambda field: arrays[f"{name}.{field}"]  # noqa: E731
+    heading = np.asarray(jax.vmap(quat_to_rpy)(jnp.float32(get("quat"))))
+    middle = get("soles")[:, :, 1].mean(axis=1)
+    loaded_speed = np.linalg.norm(get("sole_velocity")[..., :2], axis=2) * get("is_loaded")
+    return {
+        "time": get("time"),
+        "zmp": get("zmp")[:, 1] - middle,
+        "com": get("com")[:, 1] - middle,
+        "zmp_plan": get("zmp_plan"),
+        "com_plan": get("com_plan"),
+        "error": get("joint_pos") - get("set_point"),
+        "heights": get("soles")[..., 2],
+        "slip": loaded_speed.min(axis=1, where=get("is_loaded"), initial=np.inf),
+        "torque_share": get("torque_share"),
+        "rpy": np.unwrap(heading, axis=0),
+        "is_loaded": get("is_loaded"),
+    }
+
+
+def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[object]]:
+    """Return what limits each gait, in numbers, over its time upright."""
+    columns: dict[str, list[object]] = {
+        "measured": [
+            "upright, s",
+            "forward, m/s",
+            "ZMP from its reference, lateral, rms mm",
+            "CoM from its plan, lateral, rms mm",
+            "leg joints from their set-points, rms deg",
+            "time with a torque at its limit, %",
+            "loaded sole slides, mm for each m walked",
+            "swing sole's height, median of its highest, mm",
+            "both soles off the floor, % of the time",
+            "largest roll, deg",
+            "heading at the end, deg",
+        ]
+    }
+    for name in GAITS:
+        seen = inside(arrays, name)
+        forward = arrays[f"{name}.com"][:, 0]
+        rms = lambda x: float(np.sqrt(np.nanmean(np.square(x))))  # noqa: E731
+        step = seen["time"][1] - seen["time"][0]
+        slid = np.sum(np.where(np.isfinite(seen["slip"]), seen["slip"], 0.0)) * step
+        lifts = _peaks(seen["heights"])
+        columns[GAITS[name]] = [
+            float(seen["time"][-1]),
+            float((forward[-1] - forward[0]) / seen["time"][-1]),
+            1e3 * rms(seen["zmp"] - seen["zmp_plan"]),
+            1e3 * rms(seen["com"] - seen["com_plan"]),
+            float(np.degrees(rms(seen["error"][:, -12:]))),
+            100.0 * float(np.mean(seen["torque_share"] > 0.999)),
+            1e3 * slid / float(forward[-1] - forward[0]),
+            1e3 * float(np.median(lifts)),
+            100.0 * float(np.mean(~seen["is_loaded"].any(axis=1))),
+            float(np.degrees(np.abs(seen["rpy"][:, 0]).max())),
+            float(np.degrees(seen["rpy"][-1, 2])),
+        ]
+    return columns
+
+
+def _peaks(heights: np.ndarray) -> np.ndarray:
+    """Return the local maxima above 5 mm of the heights (n, 2) of both soles."""
+    inner = heights[1:-1]
+    return inner[(inner > heights[:-2]) & (inner >= heights[2:]) & (inner > 0.005)]
+
+
+def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+    """Draw both gaits side by side: a second before the bad one falls, and the tilt all the way."""
+    figure, axes = plots.new_figure(5, 2, width=11.0, height=12.0, sharey="row")
+    end = float(arrays["bad.time"][-1])
+    for column, (name, label) in zip(axes.T, GAITS.items(), strict=True):
+        seen = inside(arrays, name)
+        near = (seen["time"] > end - WINDOW) & (seen["time"] <= end)
+        shown = {field: values[near] for field, values in seen.items()}
+        _draw(column, shown, arrays[f"{name}.joint_pos"][near], arrays[f"{name}.set_point"][near])
+        column[0].set_title(label)
+        roll, _, yaw = np.degrees(seen["rpy"]).T
+        column[4].plot(seen["time"], roll, label="roll")
+        column[4].plot(seen["time"], yaw, label="heading")
+        column[4].axvspan(end - WINDOW, end, color=plots.PAPER_COLOUR, alpha=0.2, lw=0)
+        column[4].set_xlabel("time (s)")
+    for row, label in zip(
+        axes[:, 0],
+        (
+            "sideways (mm)",
+            "left knee (deg)",
+            "largest leg torque\n(share of limit)",
+            "sole's height (mm)",
+            "angle (deg)",
+        ),
+        strict=True,
+    ):
+        row.set_ylabel(label)
+    for row in axes[[0, 1, 3, 4], 0]:
+        row.legend(ncols=4, fontsize=8, loc="upper left")
+    axes[0, 0].set_ylim(-160, 160)
+    return {"inside": figure}
+
+
+def _draw(
+    axes: np.ndarray, seen: Mapping[str, np.ndarray], joint_pos: np.ndarray, set_point: np.ndarray
+) -> None:
+    time = seen["time"]
+    lines: list[tuple[Axes, np.ndarray, str, str, str]] = [
+        (axes[0], 1e3 * seen["zmp_plan"], "ZMP, reference", "--", plots.COLOURS[0]),
+        (axes[0], 1e3 * seen["zmp"], "ZMP", "-", plots.COLOURS[0]),
+        (axes[0], 1e3 * seen["com_plan"], "CoM, plan", "--", plots.COLOURS[1]),
+        (axes[0], 1e3 * seen["com"], "CoM", "-", plots.COLOURS[1]),
+        (axes[1], np.degrees(set_point[:, KNEE]), "set-point", "--", plots.COLOURS[0]),
+        (axes[1], np.degrees(joint_pos[:, KNEE]), "measured", "-", plots.COLOURS[1]),
+        (axes[2], seen["torque_share"], "", "-", plots.COLOURS[0]),
+        (axes[3], 1e3 * seen["heights"][:, 0], "left", "-", plots.COLOURS[0]),
+        (axes[3], 1e3 * seen["heights"][:, 1], "right", "-", plots.COLOURS[1]),
+    ]
+    for place, values, label, style, colour in lines:
+        place.plot(time, values, style, color=colour, label=label, lw=1.4)
+    axes[2].axhline(1.0, color=plots.FALL_COLOUR, lw=1.0)
+
+
+def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
+    """Write and say the table."""
+    del settings
+    save_table(table(arrays), folder, say)
+
+
+CLAIMS: tuple[Claim, ...] = ()

@@ -1,0 +1,197 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # The walking engine
+#
+# A walk is ten numbers. The engine turns them into joint angles, stage by stage: footsteps, zero moment
+# point (ZMP), centre of mass (CoM), swing foot, joints. No physics yet: this is what the robot *means* to
+# do.
+
+# %%
+import sys
+from pathlib import Path
+
+ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
+sys.path.insert(0, str(ROOT))
+
+from experiments.process import prepare
+
+prepare()  # It keeps what jax compiles: the next run is quicker.
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import mujoco
+import numpy as np
+
+from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
+from creps_jax.motion.walking.com import spring_height, zmp_of_com
+from creps_jax.motion.walking.engine import NUM_NODES, plan_walk, pose_at, pose_joints
+from creps_jax.motion.walking.params import PARAM_NAMES, PARAM_UNITS, params_from_theta
+from creps_jax.motion.walking.zmp import zmp_reference
+from experiments.plots import COLOURS
+from experiments.policy_file import load_policy
+
+# %%
+theta = load_policy(ROOT / "models" / "nao" / "policies" / "walk.npz").theta(0.3)
+print("What the shipped policy answers when asked for .3 m/s:")
+for name, value, unit in zip(PARAM_NAMES, theta, PARAM_UNITS, strict=True):
+    print(f"    {name:15} {value:6.3f} {unit}")
+
+# %% [markdown]
+# Eight steps, compiled as one function of the ten numbers. `plan_walk` goes from footsteps to the CoM,
+# `pose_at` to hips and feet, `pose_joints` to angles. `plan_walk` keeps its ZMP to itself, so we ask for it
+# once more, and then for the ZMP that the planned CoM really has.
+
+# %%
+NUM_STEPS, NUM_TIMES = 8, 401
+
+
+@jax.jit
+def engine(theta):
+    params = params_from_theta(theta)
+    plans = plan_walk(params, NUM_STEPS)
+    times = jnp.linspace(0, NUM_STEPS * params.step_duration, NUM_TIMES)
+    poses = jax.vmap(lambda time: pose_at(params, plans, time))(times)
+    upright = jnp.stack([0.0, params.lean, 0.0])
+    joints = jax.vmap(lambda pose: pose_joints(params, pose, upright))(poses)
+
+    phase = jnp.linspace(0, 1, NUM_NODES)
+    share = params.double_support / params.step_duration
+    height, acceleration = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
+    height = height + GEOMETRY.ankle_height + 0.025  # The CoM is that far above the hips.
+
+    def zmps(plan):
+        asked = zmp_reference(phase, plan.com[0], plan.footstep.support[:2], plan.com[-1], share)
+        real = [zmp_of_com(axis, height, acceleration, params.step_duration) for axis in plan.com.T]
+        return asked, jnp.stack(real, axis=1)
+
+    return params, plans, *jax.vmap(zmps)(plans), times, poses, joints
+
+
+params, plans, asked, real, times, poses, joints = jax.tree.map(np.asarray, engine(theta))
+
+# %% [markdown]
+# ## From footsteps to the centre of mass
+#
+# The ZMP, where the floor pushes back, has to stay under the foot that stands. The CoM cannot jump from
+# foot to foot with it: it sways between them just so that its acceleration puts the ZMP where it is wanted.
+# That is a linear system in the CoM's positions, tridiagonal, solved at once. The dots test it: the ZMP of
+# that CoM is the one that was asked for.
+
+# %%
+figure, (above, sideways) = plt.subplots(1, 2, figsize=(14, 3.4), width_ratios=(3, 2))
+outline = np.array([[-0.05, 0.11, 0.11, -0.05], [-0.04, -0.04, 0.04, 0.04]]) - [[0.02], [0.0]]
+for place, is_left in zip(plans.footstep.support, plans.footstep.supports_left, strict=True):
+    above.fill(*(outline + place[:2, None]), color=COLOURS[3 if is_left else 4], alpha=0.2)
+above.plot(*asked.reshape(-1, 2).T, color=COLOURS[1])
+above.plot(*plans.com.reshape(-1, 2).T, color=COLOURS[0])
+above.set(xlabel="forward (m)", ylabel="left (m)", title="Eight steps from above", aspect="equal")
+
+steps = np.arange(NUM_STEPS)[:, None] + np.linspace(0, 1, NUM_NODES)
+clock = params.step_duration * steps
+sideways.plot(clock[:4].ravel(), asked[:4, :, 1].ravel(), color=COLOURS[1], label="ZMP, asked for")
+sideways.plot(clock[:4, 1:-1].ravel(), real[:4, :, 1].ravel(), "k.", markersize=3, label="ZMP of the CoM")
+sideways.plot(clock[:4].ravel(), plans.com[:4, :, 1].ravel(), color=COLOURS[0], label="CoM")
+sideways.set(xlabel="time (s)", ylabel="left (m)", title="Sideways", ylim=(-0.065, 0.1))
+sideways.legend(loc="upper center", ncols=3, fontsize=8)
+plt.show()
+
+# %% [markdown]
+# ## From hips and feet to joints
+#
+# The hips follow the CoM, the swing foot a Bezier curve, and inverse kinematics finds the angles. Posed
+# with them, this is the robot, four times a step (its right side dark). MuJoCo only places the bodies here.
+
+# %%
+model = mujoco.MjModel.from_xml_path(str(ROOT / "models" / "nao" / "nao.xml"))
+data = mujoco.MjData(model)
+
+
+names = [model.geom(geom).name for geom in range(model.ngeom)]
+toes, heels = ([i for i, name in enumerate(names) if f"_sole_{end}_" in name] for end in ("front", "back"))
+
+
+def sketch(panel, hips, angles, aside):
+    data.qpos[:7] = 0, 0, 0, np.cos(params.lean / 2), 0, np.sin(params.lean / 2), 0
+    data.qpos[7:] = angles
+    mujoco.mj_kinematics(model, data)
+    ankle, toe, heel = data.xpos[model.geom_bodyid[toes]], data.geom_xpos[toes], data.geom_xpos[heels]
+    begins = np.concatenate([data.xpos[model.body_parentid[2:]], ankle, toe, heel])
+    ends = np.concatenate([data.xpos[2:], toe, heel, ankle])
+    shift = hips[:3] - data.body("left_hip1").xpos + [aside, 0, 0]
+    x, _, z = np.moveaxis(np.stack([begins, ends]) + shift, 2, 0)
+    is_left = ends[:, 1] > 0.01
+    for chosen, alpha in ((is_left, 0.3), (~is_left, 1.0)):
+        panel.plot(x[:, chosen], z[:, chosen], color=COLOURS[0], alpha=alpha, solid_capstyle="round")
+    head = data.body("head").xpos + shift
+    panel.plot(head[0], head[2], "o", color=COLOURS[0], markersize=14)
+
+
+figure, panel = plt.subplots(figsize=(13, 3.4))
+for count, index in enumerate(range(250, 351, 12)):
+    sketch(panel, poses.hips[index], joints[index], 0.22 * count)
+panel.axhline(0, color="black", linewidth=0.8)
+panel.set(ylabel="height (m)", title="Two steps, pulled apart", aspect="equal", xticks=[])
+plt.show()
+
+# %% [markdown]
+# Do the joints allow it? All but the ankle's pitch: with knees as bent as these, it stops at 75 degrees
+# (dotted lines: the limits) in the middle of each swing, and the lifted toe hangs a little.
+
+# %%
+figure, axes = plt.subplots(2, 3, figsize=(12, 5), sharex=True)
+leg = ("hip_yaw_pitch", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
+for panel, joint in zip(axes.flat, leg, strict=True):
+    for side, colour in (("left", COLOURS[3]), ("right", COLOURS[4])):
+        index = JOINT_NAMES.index(f"{side}_{joint}")
+        panel.plot(times, np.degrees(joints[:, index]), color=colour, label=side)
+        for limit in (JOINT_LOWER[index], JOINT_UPPER[index]):
+            panel.axhline(np.degrees(limit), color=colour, linestyle=":", linewidth=1.2)
+    panel.set_title(joint.replace("_", " ") + " (deg)")
+for panel in axes[1]:
+    panel.set_xlabel("time (s)")
+axes[0, 0].legend(loc="center right")
+plt.show()
+
+# %% [markdown]
+# ## What a parameter does
+#
+# Three values of one parameter each; all others stay.
+
+# %%
+figure, (sway, zmp, foot) = plt.subplots(1, 3, figsize=(14, 3.6))
+
+
+def vary(name, values):
+    for value, colour in zip(values, COLOURS, strict=False):
+        changed = np.where(np.array(PARAM_NAMES) == name, np.float32(value), theta)
+        yield {"color": colour, "label": f"{value:g}"}, jax.tree.map(np.asarray, engine(changed))
+
+
+for style, (_, plans, *_) in vary("step_duration", (0.2, 0.3, 0.4)):
+    sway.plot(steps[:2].ravel(), plans.com[4:6, :, 1].ravel(), **style)
+for style, (_, _, asked, *_) in vary("double_support", (0.0, 0.05, 0.1)):
+    zmp.plot(steps[:2].ravel(), asked[4:6, :, 1].ravel(), **style)
+for style, (*_, poses, _) in vary("swing_height", (0.02, 0.04, 0.06)):
+    foot.plot(poses.left[250:301, 0], poses.left[250:301, 2], **style)
+sway.set(xlabel="time (steps)", ylabel="CoM, left (m)", title="Slow steps sway more")
+sway.legend(title="step_duration (s)")
+zmp.set(xlabel="time (steps)", ylabel="ZMP, left (m)", title="Both feet stand: weight shifts slowly")
+zmp.legend(title="double_support (s)")
+foot.set(xlabel="forward (m)", ylabel="left sole, up (m)", title="The swing foot's arc", ylim=(0, 0.1))
+foot.legend(title="swing_height (m)", ncols=3)
+plt.show()

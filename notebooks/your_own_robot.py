@@ -1,0 +1,155 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#       format_version: '1.3'
+#       jupytext_version: 1.19.6
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Your own robot
+#
+# A simulator that jax cannot trace, a real robot, a person with a tape measure: whatever answers "how good
+# was that?" can be learned with. `ask` proposes, you measure, `tell` learns.
+
+# %%
+import sys
+from pathlib import Path
+
+ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
+sys.path.insert(0, str(ROOT))
+
+from experiments.process import prepare
+
+prepare()  # It keeps what jax compiles: the next run is quicker.
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+import creps_jax as cj
+from experiments.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
+from experiments.plots import COLOURS, PAPER_COLOUR
+
+# %% [markdown]
+# ## A robot in plain Python
+#
+# It throws a ball over a wall, to land as far away as it is asked. It is a robot: the arm trembles, and of
+# ten throws the camera loses one. That one is NaN, and will be ignored.
+
+# %%
+WALL, TOP = 2.0, 2.5  # Where the wall stands, and how high, m.
+rng = np.random.default_rng(0)
+
+
+def throw(speed, angle):
+    """Return the path (n, 2) of a ball thrown at a speed (m/s) and angle (deg), 1 m above the ground."""
+    path, step = [np.array([0.0, 1.0])], 0.01
+    velocity = speed * np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
+    while path[-1][1] > 0:
+        velocity = velocity - step * (np.array([0, 9.81]) + 0.02 * np.hypot(*velocity) * velocity)
+        path.append(path[-1] + step * velocity)
+        if path[-2][0] < WALL <= path[-1][0] and path[-1][1] < TOP:
+            velocity = velocity * [-0.2, 1.0]
+            path[-1] = path[-2]
+    return np.array(path)
+
+
+def measure(wanted, speed, angle):
+    """Return the reward of one throw: how close it landed, and how gently it was thrown."""
+    if rng.random() < 0.1:
+        return np.nan
+    landed = throw(speed + 0.05 * rng.normal(), angle + 0.5 * rng.normal())[-1, 0]
+    return -((landed - wanted) ** 2) - 0.005 * speed**2
+
+
+# %% [markdown]
+# ## Learn from 20 throws at a time
+#
+# The learner thinks in numbers without bounds; `sigmoid_gate` squashes them into what the arm can do. Tell
+# it what it asked for, not what came out of the gate.
+
+# %%
+near, far = 3.0, 8.0
+LOW, HIGH = np.float32([4.0, 20.0]), np.float32([12.0, 80.0])  # Speed (m/s) and angle (deg).
+features = cj.rbf_features(near, far, 4)
+algorithm = cj.creps(features, features, kl_bound=0.5, archive_size=120)
+start = cj.LinearGaussian(coef=jnp.zeros((features.size, 2)), cov_chol=jnp.eye(2))
+
+
+def arm(thetas):
+    return np.asarray(cj.sigmoid_gate(thetas, LOW, HIGH))
+
+
+def learn(state, log, iterations):
+    for _ in range(iterations):
+        wanted = rng.uniform(near, far, (20, 1))
+        thetas = algorithm.ask(jax.random.key(int(state.iteration)), state, wanted)
+        rewards = np.array([measure(*trial) for trial in np.hstack([wanted, arm(thetas)])])
+        state, _ = algorithm.tell(state, cj.Batch(wanted, thetas, rewards))
+        log = np.vstack([log, rewards])
+    return state, log
+
+
+state, log = learn(algorithm.init(start), np.zeros((0, 20)), 15)
+
+# %% [markdown]
+# ## Stop, and go on tomorrow
+#
+# The state is all there is: policy, archive, number of iterations. A checkpoint is written whole or not at
+# all, and refuses to be loaded into another run.
+
+# %%
+path, run = ROOT / "results" / "ball.npz", {"robot": "ball", "seed": 0}
+save_checkpoint(path, Checkpoint(state, {"rewards": log}), run=run)
+
+state, saved = load_checkpoint(path, algorithm.init(start), run=run)
+state, log = learn(state, saved["rewards"], 25)
+print(f"{state.iteration} iterations, {log.size} throws, {np.isnan(log).sum()} of them lost")
+
+# %% [markdown]
+# ## What it learned
+
+# %%
+figure, (curve, speeds, angles) = plt.subplots(1, 3, figsize=(14, 3.6))
+curve.plot(-log.ravel(), ".", color=COLOURS[0], alpha=0.4, markersize=4, label="a throw")
+curve.plot(np.arange(20, 801, 20), -np.nanmedian(log, axis=1), color=COLOURS[1], label="median of 20")
+curve.axvline(300, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label="saved, loaded")
+curve.set(xlabel="throws", ylabel="-reward", title="Learning curve", yscale="log")
+curve.legend(fontsize=8)
+
+grid = np.linspace(near, far, 51)[:, None]
+mean, std = np.asarray(algorithm.mean(state.policy, grid)), np.linalg.norm(state.policy.cov_chol, axis=1)
+low, middle, high = (arm(jnp.asarray(mean + share * std)).T for share in (-2, 0, 2))
+for index, (panel, name) in enumerate(((speeds, "speed (m/s)"), (angles, "angle (deg)"))):
+    panel.fill_between(grid[:, 0], low[index], high[index], color=COLOURS[0], alpha=0.2, linewidth=0)
+    panel.plot(grid[:, 0], middle[index], color=COLOURS[0])
+    panel.set(xlabel="distance asked for (m)", ylabel=name, ylim=(LOW[index], HIGH[index]))
+speeds.set_title("The policy, ±2 std: how fast")
+angles.set_title("... and how steep")
+plt.show()
+
+# %%
+targets = np.linspace(3.5, 8.0, 4)
+first = arm(algorithm.ask(jax.random.key(0), algorithm.init(start), np.zeros((20, 1))))
+last = arm(algorithm.mean(state.policy, targets[:, None]))
+
+figure, (before, after) = plt.subplots(1, 2, figsize=(13, 3.4), sharex=True, sharey=True)
+for speed, angle in first:
+    before.plot(*throw(speed, angle).T, color=PAPER_COLOUR, linewidth=1)
+for target, (speed, angle), colour in zip(targets, last, COLOURS, strict=False):
+    after.plot(*throw(speed, angle).T, color=colour)
+    after.plot(target, 0, "v", color=colour, markersize=12, clip_on=False)
+for panel, title in ((before, "What it tries at first"), (after, "What it learned, for four distances")):
+    panel.plot([WALL, WALL], [0, TOP], color="black", linewidth=4)
+    panel.set(xlabel="distance (m)", title=title, xlim=(0, 9), ylim=(0, 5), aspect="equal")
+before.set_ylabel("height (m)")
+plt.show()
