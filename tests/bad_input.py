@@ -496,7 +496,7 @@ ROWS = {
         **{**{name: argument for name, argument in RUN.items() if name != "key"}, "task": record(TASK)},
     ),
     "uniform_contexts": row(cj.uniform_contexts, use=use_sampler, low=vector(0.0), high=vector(1.0)),
-    "uniform_contexts()": row(cj.uniform_contexts(0.0, 1.0), key=key()),
+    "uniform_contexts()": row(cj.uniform_contexts(0.0, 1.0), key=key(KEY)),
     "via_point_reaching": row(
         cj.via_point_reaching,
         use=use_task,
