@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import logsumexp
 
-from creps_jax import checks
 from creps_jax.linalg import exact_dot
 from creps_jax.policy import LinearGaussian
 from creps_jax.typing import Array, Bool, Float, Int, IntScalar
@@ -38,8 +37,10 @@ class Importance:
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        checks.count("num_policies", self.num_policies)
-        checks.number("least_effective", self.least_effective, least=1.0)
+        if self.num_policies < 1:
+            raise ValueError(f"num_policies must be at least 1, got {self.num_policies}")
+        if not self.least_effective >= 1.0:
+            raise ValueError(f"least_effective must be at least 1, got {self.least_effective}")
 
 
 class PolicyHistory(NamedTuple):
@@ -90,22 +91,9 @@ def importance_weights(
         Weights that sum to one, zero where a sample does not count or its policy is no longer kept; all
         zero if none does.
 
-    Raises:
-        ValueError: If shapes do not fit each other.
-
     Source: Veach and Guibas 1995, the balance heuristic.
     """
-    num_features, dim = checks.array("policy.coef", policy.coef, ("p", "d")).shape
-    num_policies = len(checks.array("history.coef", history.coef, ("K", num_features, dim)))
-    num = len(checks.array("theta", theta, ("n", dim)))
-    for name, value, shape in (
-        ("policy.cov_chol", policy.cov_chol, (dim, dim)),
-        ("history.cov_chol", history.cov_chol, (num_policies, dim, dim)),
-        ("features", features, (num, num_features)),
-        ("age", age, (num,)),
-        ("is_valid", is_valid, (num,)),
-    ):
-        checks.array(name, value, shape)
+    num_policies = history.coef.shape[0]
     is_counted = is_valid & (age < num_policies)
     place = (iteration - age) % num_policies
     drawn = jax.nn.one_hot(place, num_policies, dtype=theta.dtype) * is_counted[:, None].astype(theta.dtype)

@@ -190,7 +190,9 @@ def _resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Pa
     manifest = results.load_manifest(folder)
     for field, kind in (("seed", int), ("seconds", float | int)):
         if not isinstance(manifest.get(field), kind):
-            raise UserError(f"{folder} has no {field} in its manifest, expected a number: it cannot be resumed")
+            raise UserError(
+                f"{folder} has no {field} in its manifest, expected a number: it cannot be resumed"
+            )
     for field, asked in (("experiment", request.name), ("preset", request.preset), ("seed", request.seed)):
         if asked is not None and manifest.get(field) != asked:
             raise UserError(
@@ -259,7 +261,9 @@ def _whole_results(folder: Path) -> Iterator[None]:
     try:
         yield
     except KeyError as error:
-        raise UserError(f"{folder / results.ARRAYS} lacks {error}: it is of another version or experiment") from error
+        raise UserError(
+            f"{folder / results.ARRAYS} lacks {error}: it is of another version or experiment"
+        ) from error
 
 
 def _latest_finished(name: str) -> Path:

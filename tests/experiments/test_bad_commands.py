@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,9 @@ from hypothesis import strategies as st
 
 from experiments import results, walk
 from experiments.cli import main
+from experiments.session import plain, storage
+from experiments.session.settings import Settings
+from tests.experiments.test_robot_session import DEFINITION, fill
 
 Mistake = tuple[list[str], str]
 """The arguments, and what of them the error has to show."""
@@ -33,6 +37,10 @@ NO_POLICIES = st.sampled_from(
 NO_FOLDERS = st.sampled_from(["file", "file/below", "/proc/nowhere", "long" * 100])
 NO_NEW_FOLDERS = NO_FOLDERS | st.just("full")
 NO_VIDEOS = st.sampled_from(["walk.gif", "walk.png", "full", "folder.mp4", "file/w.mp4", "/proc/w.mp4"])
+NO_NUMBERS = WORDS | st.sampled_from(["-1", "0", "-inf", "inf"])
+NO_EXPORTS = st.sampled_from(["policy.txt", "walk", "walk.csv", "folder.h", "file/p.onnx", "/proc/p.h"])
+NO_SESSIONS = st.sampled_from(["nowhere", "file", "full", "file/below", "arm/.lock", "other-arm", "cut-arm"])
+NO_DEFINITIONS = st.sampled_from(["none.json", "file", "full", "whole.npz", "manifest.json"])
 NO_RESULTS = st.sampled_from(["none", "file", "file/below", "full", "cut", "other", "lacking", "empty"])
 
 
@@ -73,14 +81,47 @@ COMMANDS = {
         option("video", "--policy", "whole.npz", "--out", values=NO_VIDEOS),
         st.integers(25, 1000).map(lambda num: (["video", "--speeds", *["0.3"] * num], str(num))),
     ),
+    "export": st.one_of(
+        option("export", "--to", values=NO_EXPORTS),
+        option("export", "--to", "p.h", "--policy", values=NO_POLICIES),
+        option("export", "--to", "p.h", "--speed", values=st.just("0.3")),
+        option("export", "--to", "w.csv", "--policy", "whole.npz", "--speed", values=NO_SPEEDS),
+        option(
+            *("export", "--to", "w.csv", "--policy", "whole.npz", "--speed", "0.3", "--duration"),
+            values=NO_NUMBERS | st.just("1e9"),
+        ),
+    ),
+    "session new": st.one_of(
+        option("session", "new", "--define", "arm.json", values=NO_NEW_FOLDERS),
+        option("session", "new", "new", values=st.just("--policy")),
+        option("session", "new", "new", "--define", values=NO_DEFINITIONS),
+        option("session", "new", "new", "--policy", values=NO_POLICIES),
+        option("session", "new", "new", "--policy", "whole.npz", "--exploration", values=NO_NUMBERS),
+        option("session", "new", "new", "--define", "arm.json", "--batch-size", values=NO_COUNTS),
+        option("session", "new", "new", "--define", "arm.json", "--archive-size", values=NO_COUNTS),
+        option("session", "new", "new", "--define", "arm.json", "--kl-bound", values=NO_NUMBERS),
+        option("session", "new", "new", "--define", "arm.json", "--seed", values=NO_SEEDS),
+    ),
+    "session": st.one_of(
+        option("session", values=NO_NAMES),
+        option("session", "ask", values=NO_SESSIONS),
+        option("session", "ask", "arm", "--more", values=NO_COUNTS),
+        option("session", "ask", "arm", "--more", "1", "--context", values=NO_NUMBERS),
+        option("session", "status", values=NO_SESSIONS),
+        option("session", "tell", "arm", "--broken", values=WORDS | st.sampled_from(["0", "-1", "4", "1e3"])),
+        option("session", "tell", "arm", "1", "--reward", values=WORDS | st.sampled_from(["inf", "1e39"])),
+        st.just((["session", "tell", "arm", "1"], "--reward")),
+        st.just((["session", "tell", "arm", "1", "--reward", "1", "--broken"], "--broken")),
+        option("session", "save", "--to", "p.npz", values=NO_SESSIONS),
+    ),
 }
 
 
 @pytest.fixture
 def folder(tiny):
-    """Work in a folder of files that are none of what they should be, and of one whole policy."""
+    """Work in a folder of files that are none of what they should be, of one whole policy and one session."""
     Path("file").write_text("text")
-    for name in ("full", "empty", "folder.mp4"):
+    for name in ("full", "empty", "folder.mp4", "folder.h"):
         Path(name).mkdir()
     Path("full/notes.txt").write_text("mine")
     quick = walk.SETTINGS["quick"]
@@ -98,9 +139,23 @@ def folder(tiny):
             results.save_arrays(Path(name) / results.ARRAYS, {"something": 1.0})
         else:
             (Path(name) / results.ARRAYS).write_bytes(text)
+    make_sessions()
     Path("lacking/checkpoint-tiny.npz").write_bytes(b"PK")
     Path("cut/checkpoint-tiny.npz").write_bytes(b"PK")
     return Path()
+
+
+def make_sessions():
+    """Make a session of three trials, one whose trials are of other settings, and one that is cut short."""
+    Path("arm.json").write_text(json.dumps(DEFINITION))
+    results.save_json(Path("manifest.json"), {"experiment": "tiny"})
+    settings = plain.read(Settings, DEFINITION, "DEFINITION")
+    for name in ("arm", "other-arm", "cut-arm"):
+        storage.create(Path(name), settings)
+        fill(Path(name), 3)
+    (Path("other-arm") / storage.SETTINGS).write_text(json.dumps({**DEFINITION, "kl_bound": 0.1}))
+    trials = Path("cut-arm") / storage.TRIALS
+    trials.write_bytes(trials.read_bytes()[:-20])
 
 
 def contents(folder: Path) -> dict[str, bytes | None]:
