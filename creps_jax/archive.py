@@ -35,13 +35,13 @@ class Archive(NamedTuple):
     age: Int[Array, " L"]
 
 
+@checks.arguments
 def empty_archive(archive_size: int, context_dim: int, theta_dim: int) -> Archive:
     """Make an archive of `archive_size` empty slots.
 
     Raises:
         ValueError: If `archive_size` is no whole number of at least 1.
     """
-    archive_size = checks.count("archive_size", archive_size)
     batch = Batch(
         context=jnp.zeros((archive_size, context_dim), jnp.float32),
         theta=jnp.zeros((archive_size, theta_dim), jnp.float32),

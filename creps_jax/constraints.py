@@ -64,7 +64,7 @@ def violation(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) ->
     Raises:
         ValueError: If bounds do not fit the parameters or each other, or a number is none.
     """
-    theta, low, high = _box(theta, low, high, is_bounded=False)
+    theta, low, high = _box(theta, low, high, largest=math.inf)
     return jnp.maximum(jnp.maximum(low - theta, theta - high), 0.0)
 
 
@@ -78,7 +78,7 @@ def penalty(violation: Float[Array, "*b c"], size: ScalarLike) -> Float[Array, "
 
 
 def _box(
-    theta: Array, low: VectorLike, high: VectorLike, *, is_bounded: bool = True
+    theta: Array, low: VectorLike, high: VectorLike, *, largest: float = checks.FLOAT32_MAX
 ) -> tuple[Array, Array, Array]:
     """Return parameters and bounds as arrays of one shape and type, after checking them."""
     theta = checks.array("theta", theta)
@@ -90,7 +90,7 @@ def _box(
         )
     checks.finite("theta", theta, largest=math.inf)
     for name, end in (("low", low), ("high", high)):
-        checks.finite(name, end, largest=None if is_bounded else math.inf)
+        checks.finite(name, end, largest=largest)
     is_known = not (isinstance(low, Tracer) or isinstance(high, Tracer))
     if is_known and np.any(np.asarray(low) > np.asarray(high)):
         raise ValueError(f"low must not exceed high, got {low} and {high}")

@@ -15,6 +15,7 @@ Sampler = Callable[[PRNGKey], Array]
 """(key) -> context (s,)."""
 
 
+@checks.arguments
 def gaussian_contexts(
     low: VectorLike, high: VectorLike, *, std: VectorLike | None = None, clip: bool = False
 ) -> Sampler:
@@ -41,8 +42,8 @@ def gaussian_contexts(
         raise ValueError(f"std must be positive, a number or of shape {low.shape}, got {std}")
     middle, scale = (low + high) / 2, np.broadcast_to(scale, low.shape)
 
+    @checks.arguments
     def sample_context(key: PRNGKey) -> Float[Array, " s"]:
-        checks.key("key", key)
         context = jnp.asarray(middle) + scale * jax.random.normal(key, low.shape)
         return jnp.clip(context, low, high) if clip else context
 
@@ -64,12 +65,14 @@ def uniform_contexts(low: VectorLike, high: VectorLike) -> Sampler:
     """
     low, high = _checked_range(low, high)
 
+    @checks.arguments
     def sample_context(key: PRNGKey) -> Float[Array, " s"]:
-        return jax.random.uniform(checks.key("key", key), low.shape, minval=low, maxval=high)
+        return jax.random.uniform(key, low.shape, minval=low, maxval=high)
 
     return sample_context
 
 
+@checks.arguments
 def context_grid(low: VectorLike, high: VectorLike, num: int) -> Float[Array, "n s"]:
     """Lay out contexts evenly over a range, both ends included, to evaluate a policy on.
 

@@ -95,6 +95,7 @@ class Creps:
             checks.function(name, getattr(self, name), arguments)
 
 
+@checks.arguments
 def creps(
     policy_features: FeatureMap,
     baseline_features: FeatureMap,
@@ -129,8 +130,7 @@ def creps(
 
     Source: Abdolmaleki et al. 2016, Section 3.1.
     """
-    _check_settings(policy_features, baseline_features, kl_bound, archive_size, ridge)
-    checks.instance("importance", importance, Importance, type(None))
+    _check_settings(policy_features, baseline_features, kl_bound, ridge)
     checks.function("m_step", m_step, "(policy, samples, *, ridge, scale) -> policy")
     if m_step is bounded_ml:
         raise ValueError(
@@ -328,7 +328,6 @@ def _check_settings(
     policy_features: FeatureMap,
     baseline_features: FeatureMap,
     kl_bound: float | int,
-    archive_size: int,
     ridge: float | int,
 ) -> None:
     _check_features("policy_features", policy_features)
@@ -339,12 +338,10 @@ def _check_settings(
             f"{policy_features.context_dim} and {baseline_features.context_dim} variables"
         )
     checks.number("kl_bound", kl_bound, above=0.0)
-    checks.count("archive_size", archive_size)
     checks.number("ridge", ridge, least=0.0)
 
 
 def _check_features(name: str, features: FeatureMap) -> None:
-    checks.instance(name, features, FeatureMap)
     checks.function(f"{name}.apply", features.apply, "(context) -> features")
     size = checks.count(f"{name}.size", features.size)
     checks.count(f"{name}.context_dim", features.context_dim)

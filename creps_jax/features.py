@@ -27,6 +27,7 @@ class FeatureMap(NamedTuple):
     a unit, and its size on the samples has to do."""
 
 
+@checks.arguments
 def linear_features(dim: int) -> FeatureMap:
     """Make the features [1, s] of an affine policy.
 
@@ -41,7 +42,6 @@ def linear_features(dim: int) -> FeatureMap:
 
     Source: Abdolmaleki et al. 2016, text below Eq. 15.
     """
-    dim = checks.count("dim", dim)
 
     def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
         context = _checked_context(context, dim)
@@ -50,6 +50,7 @@ def linear_features(dim: int) -> FeatureMap:
     return FeatureMap(apply, 1 + dim, dim)
 
 
+@checks.arguments
 def quadratic_features(dim: int) -> FeatureMap:
     """Make the features [s, s^2] of a quadratic baseline.
 
@@ -67,7 +68,6 @@ def quadratic_features(dim: int) -> FeatureMap:
 
     Source: Abdolmaleki et al. 2016, text below Eq. 11 and 15.
     """
-    dim = checks.count("dim", dim)
 
     def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
         context = _checked_context(context, dim)

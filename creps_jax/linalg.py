@@ -31,6 +31,7 @@ def exact_dot(left: Float[Array, "..."], right: Float[Array, "..."]) -> Float[Ar
     return jnp.dot(left, right, precision=lax.Precision.HIGHEST)
 
 
+@checks.arguments
 def thomas_solve(
     lower: Float[Array, " n"],
     diag: Float[Array, " n"],
@@ -58,18 +59,10 @@ def thomas_solve(
 
     Source: Abdolmaleki et al. 2016, Eq. 7 and 8 (with `a(k)` in the denominator, which the print has wrong).
     """
-    given = {"lower": lower, "diag": diag, "upper": upper, "rhs": rhs}
-    lower, diag, upper, rhs = (checks.array(name, entries) for name, entries in given.items())
-    shapes = [entries.shape for entries in (lower, diag, upper, rhs)]
-    if len(set(shapes)) != 1 or len(shapes[0]) != 1 or shapes[0][0] < 1:
-        raise ValueError(
-            "thomas_solve needs lower, diag, upper and rhs to be vectors of one length n >= 1, "
-            f"got shapes {shapes}"
-        )
     # What is not used must not enter: zero times a non-finite number is not zero.
     lower = lower.at[0].set(0.0)
     upper = upper.at[-1].set(0.0)
-    for name, entries in zip(given, (lower, diag, upper, rhs), strict=True):
+    for name, entries in (("lower", lower), ("diag", diag), ("upper", upper), ("rhs", rhs)):
         checks.finite(name, entries)
 
     def eliminate(above: _Pair, row: tuple[Array, Array, Array, Array]) -> tuple[_Pair, _Pair]:

@@ -42,6 +42,7 @@ MStep = Callable[..., LinearGaussian]
 """`(old policy, samples, *, ridge, scale) -> new policy`; see `fit_weighted_ml` for the settings."""
 
 
+@checks.arguments
 def weighted_ml(
     policy: LinearGaussian,
     samples: WeightedSamples,
@@ -54,6 +55,7 @@ def weighted_ml(
     return fit_weighted_ml(features, theta, weights, ridge=ridge, scale=scale, start=policy.coef)
 
 
+@checks.arguments
 def bounded_ml(
     *, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05, entropy_loss_bound: float | None = None
 ) -> MStep:

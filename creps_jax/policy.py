@@ -117,6 +117,7 @@ def entropy(policy: LinearGaussian) -> Scalar:
     return _half_log_det(policy) + 0.5 * (1.0 + _LOG_TWO_PI) * policy.cov_chol.shape[0]
 
 
+@checks.arguments
 def fit_weighted_ml(
     features: Float[Array, "n p"],
     theta: Float[Array, "n d"],
@@ -151,19 +152,11 @@ def fit_weighted_ml(
 
     Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
     """
-    features, theta = checks.array("features", features, ("n", "p")), checks.array("theta", theta, ("n", "d"))
-    weights = checks.finite("weights", checks.array("weights", weights, ("n",)), least=0.0)
-    if not len(features) == len(theta) == len(weights):
-        raise ValueError(
-            "fit_weighted_ml needs features (n, p), theta (n, d) and weights (n,), "
-            f"got shapes {features.shape}, {theta.shape} and {weights.shape}"
-        )
+    checks.finite("weights", weights, least=0.0)
     checks.number("ridge", ridge, least=0.0)
     if scale is not None:
-        scale = checks.finite("scale", checks.array("scale", scale, features.shape[1:]), above=0.0)
-        checks.finite("scale", scale, largest=checks.LARGEST)
+        checks.finite("scale", scale, above=0.0, largest=checks.LARGEST)
     if start is not None:
-        start = checks.array("start", start, (features.shape[1], theta.shape[1]))
         checks.finite("start", start, largest=checks.LARGEST)
     is_weighted = weights > 0
     features = jnp.where(is_weighted[:, None], features, 0.0)

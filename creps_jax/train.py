@@ -49,6 +49,7 @@ class IterationLog(NamedTuple):
     the fraction. NaN if all failed."""
 
 
+@checks.arguments
 def make_iteration(
     task: Task, algorithm: Creps, *, samples: int, devices: Devices = None
 ) -> Callable[[PRNGKey, CrepsState], tuple[CrepsState, IterationLog]]:
@@ -74,13 +75,14 @@ def make_iteration(
     """
     setup = _make_setup(task, algorithm, samples, devices)
 
+    @checks.arguments
     def iteration(key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
-        checks.key("key", key)
         return _iterate(setup, key, replicate(_checked_state("state", state), setup.devices))
 
     return iteration
 
 
+@checks.arguments
 def train(
     key: PRNGKey,
     task: Task,
@@ -114,8 +116,7 @@ def train(
         ValueError: If an argument is none of what is asked for here, or state, task and features do not fit
             each other.
     """
-    checks.key("key", key)
-    _check_run(task, algorithm, start, on_iteration)
+    _check_callback(on_iteration)
     state = _checked_start(start) if isinstance(start, CrepsState) else algorithm.init(start)
     phases = _phases(task, algorithm, state, iterations, samples, first_samples, devices)
     state = replicate(state, phases[0][0].devices)
@@ -123,6 +124,7 @@ def train(
     return state, jax.tree.map(jnp.asarray, logs)
 
 
+@checks.arguments
 def train_trials(
     keys: Key[Array, " trials"] | UInt32[Array, "trials 2"],
     task: Task,
@@ -157,8 +159,8 @@ def train_trials(
     Raises:
         ValueError: As in `train`, and if there is not one state for each key.
     """
-    num_trials = checks.number_of_keys("keys", keys)
-    _check_run(task, algorithm, start, on_iteration)
+    num_trials = len(checks.key("keys", keys, num_axes=1))
+    _check_callback(on_iteration)
     if isinstance(start, CrepsState):
         states = _checked_start(start)
     else:
@@ -178,6 +180,7 @@ def train_trials(
     return states, jax.tree.map(lambda x: jnp.asarray(np.swapaxes(x, 0, 1)), logs)
 
 
+@checks.arguments
 def evaluate(
     key: PRNGKey,
     task: Task,
@@ -204,12 +207,8 @@ def evaluate(
     Raises:
         ValueError: If a shape does not fit the task, or `repeats` is less than 1.
     """
-    checks.key("key", key)
-    checks.instance("task", task, Task)
-    repeats = checks.count("repeats", repeats)
-    contexts, thetas = checks.array("contexts", contexts), checks.array("thetas", thetas)
-    num = contexts.shape[0] if contexts.ndim else 0
-    if contexts.shape != (num, task.context_dim) or thetas.shape != (num, task.theta_dim) or num == 0:
+    num = len(contexts)
+    if contexts.shape[1] != task.context_dim or thetas.shape[1] != task.theta_dim:
         raise ValueError(
             f"the task takes contexts (n, {task.context_dim}) and thetas (n, {task.theta_dim}), "
             f"got {contexts.shape} and {thetas.shape}"
@@ -229,9 +228,7 @@ class _Setup(NamedTuple):
 
 
 def _make_setup(task: Task, algorithm: Creps, samples: int, devices: Devices) -> _Setup:
-    checks.instance("task", task, Task)
-    checks.instance("algorithm", algorithm, Creps)
-    return _Setup(task, algorithm, checks.count("samples", samples), device_tuple(devices))
+    return _Setup(task, algorithm, samples, device_tuple(devices))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -291,11 +288,8 @@ def _phases(
     devices: Devices,
 ) -> list[tuple[_Setup, int]]:
     """List with how many samples to run how many iterations."""
-    iterations = checks.count("iterations", iterations)
     ordinary = _make_setup(task, algorithm, samples, devices)
     is_begun = np.any(np.asarray(state.iteration) > 0)
-    if first_samples is not None:
-        first_samples = checks.count("first_samples", first_samples)
     if first_samples is None or is_begun:
         return [(ordinary, iterations)]
     phases = [(ordinary._replace(samples=first_samples), 1), (ordinary, iterations - 1)]
@@ -324,10 +318,7 @@ def _run(
     return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
 
 
-def _check_run(task: Task, algorithm: Creps, start: Any, on_iteration: OnIteration | None) -> None:
-    checks.instance("task", task, Task)
-    checks.instance("algorithm", algorithm, Creps)
-    checks.instance("start", start, LinearGaussian, CrepsState)
+def _check_callback(on_iteration: OnIteration | None) -> None:
     if on_iteration is not None:
         checks.function("on_iteration", on_iteration, "(state, log)")
 

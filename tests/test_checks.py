@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from creps_jax import checks
+from creps_jax.typing import Array, Float, PRNGKey, ScalarLike
 
 
 def test_checks_add_nothing_to_a_program():
@@ -16,7 +17,50 @@ def test_checks_add_nothing_to_a_program():
         checks.number("size", size, above=0.0)
         return checks.finite("x", checks.array("x", x, ("n", 2)), least=0.0)
 
-    assert not jax.make_jaxpr(checked)(jax.random.key(0), jnp.full((3, 2), jnp.nan), -1.0).eqns
+    @checks.arguments
+    def annotated(key: PRNGKey, x: Float[Array, "n 2"], size: ScalarLike):
+        return x
+
+    for function in (checked, annotated):
+        assert not jax.make_jaxpr(function)(jax.random.key(0), jnp.full((3, 2), jnp.nan), -1.0).eqns
+
+
+@checks.arguments
+def annotated(
+    table: Float[Array, "n 2"],
+    row: Float[Array, " n"] | None,
+    factor: ScalarLike,
+    num: int,
+    kind: type,
+    *,
+    key: PRNGKey | None = None,
+    free=None,
+):
+    return table, row, factor, num, kind, key, free
+
+
+def test_arguments_become_what_their_annotations_say():
+    table, row, *rest = annotated([[1, 2]], np.arange(1), 0.5, np.int64(3), int, free="x")
+    assert (table.dtype, table.shape, row.dtype) == (jnp.float32, (1, 2), jnp.float32)
+    assert rest == [0.5, 3, int, None, "x"]
+    assert annotated(table, None, 1, 1, int)[1] is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"table": np.ones((3, 1))}, r"table must have shape \(n, 2\), got \(3, 1\)"),
+        ({"row": np.ones(3)}, r"row must have shape \(2,\) beside table \(2, 2\), got \(3,\)"),
+        ({"factor": np.nan}, "factor must be finite, got nan"),
+        ({"num": 0}, "num must be at least 1, got 0"),
+        ({"kind": 3}, "kind must be of type type, got 3"),
+        ({"key": 3}, "key must be a random key, .* got 3"),
+    ],
+)
+def test_arguments_are_held_to_their_annotations(change, message):
+    good = {"table": np.ones((2, 2)), "row": None, "factor": 1.0, "num": 1, "kind": int}
+    with pytest.raises(ValueError, match=message):
+        annotated(**{**good, **change})
 
 
 @pytest.mark.parametrize(
@@ -65,7 +109,10 @@ def test_an_array_that_is_good_is_returned_itself():
             "x must be finite and at least 0, got -2.0",
         ),
         (partial(checks.key, "key", 0), r"key must be a random key, such as jax.random.key\(0\), got 0"),
-        (partial(checks.number_of_keys, "keys", jax.random.key(0)), r"keys must be random keys, .* got key<"),
+        (
+            partial(checks.key, "keys", jax.random.key(0), num_axes=1),
+            r"keys must be random keys, .* got key<",
+        ),
         (partial(checks.function, "f", 3, "(x)"), r"f must be a function \(x\), got 3"),
         (partial(checks.instance, "x", 3, str, list), "x must be of type str or list, got 3"),
     ],
@@ -78,5 +125,5 @@ def test_errors_show_the_value_and_what_was_expected(check, message):
 def test_old_and_new_keys_are_keys():
     for key in (jax.random.key(0), jax.random.PRNGKey(0), np.asarray(jax.random.PRNGKey(0))):
         assert checks.key("key", key) is key
-    assert checks.number_of_keys("keys", jax.random.split(jax.random.key(0), 3)) == 3
-    assert checks.number_of_keys("keys", jax.random.split(jax.random.PRNGKey(0), 3)) == 3
+    for keys in (jax.random.split(key, 3) for key in (jax.random.key(0), jax.random.PRNGKey(0))):
+        assert checks.key("keys", keys, num_axes=1) is keys

@@ -53,6 +53,7 @@ _ROLL_FOLD = 0.003
 _TINY = 1e-8
 
 
+@checks.arguments
 def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike) -> Float[Array, "4 4"]:
     """Return the pose of the sole in the torso frame, `T_torso_sole`.
 
@@ -63,7 +64,7 @@ def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike) -> Float[Array, "4 4"
     Raises:
         ValueError: If there are not six finite angles, or `side` is neither side.
     """
-    joint_pos = checks.finite("joint_pos", checks.array("joint_pos", joint_pos, (6,)))
+    checks.finite("joint_pos", joint_pos)
     side = _checked_side(side, joint_pos.dtype)
     yaw_pitch, hip_roll, hip_pitch, knee, ankle_pitch, ankle_roll = joint_pos
     tilt = side * _HIP_TILT
@@ -87,6 +88,7 @@ def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike) -> Float[Array, "4 4"
     return rigid_transform(R_torso_sole, position)
 
 
+@checks.arguments
 def leg_ik(T_torso_sole: Float[Array, "4 4"], side: ScalarLike) -> Float[Array, "6"]:
     """Return the joint angles that bring the sole to a pose in the torso frame, the inverse of `leg_fk`.
 
@@ -105,7 +107,7 @@ def leg_ik(T_torso_sole: Float[Array, "4 4"], side: ScalarLike) -> Float[Array, 
     Raises:
         ValueError: If the pose is no finite matrix (4, 4), or `side` is neither side.
     """
-    T_torso_sole = checks.finite("T_torso_sole", checks.array("T_torso_sole", T_torso_sole, (4, 4)))
+    checks.finite("T_torso_sole", T_torso_sole)
     side = _checked_side(side, T_torso_sole.dtype)
     R_torso_sole, position = T_torso_sole[:3, :3], T_torso_sole[:3, 3]
 
@@ -150,7 +152,6 @@ def _solve_hip(R_torso_thigh: Float[Array, "3 3"], side: Scalar) -> tuple[Scalar
 
 
 def _checked_side(side: ScalarLike, dtype: jnp.dtype) -> Array:
-    side = checks.number("side", side)
     if not isinstance(side, Tracer) and side not in (LEFT, RIGHT):
         raise ValueError(f"side must be LEFT ({LEFT}) or RIGHT ({RIGHT}), got {side!r}")
     return jnp.asarray(side, dtype)

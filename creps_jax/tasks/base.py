@@ -5,6 +5,7 @@ outcome. Everything is written for one rollout; the caller vmaps.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -99,6 +100,7 @@ def check_outcome(outcome: Any) -> Any:
     return outcome
 
 
+@checks.arguments
 def average_repeats(task: Task, repeats: int) -> Task:
     """Average every rollout over repeats with keys of their own (Abdolmaleki et al. 2016, 4.3.1).
 
@@ -113,8 +115,6 @@ def average_repeats(task: Task, repeats: int) -> Task:
     Raises:
         ValueError: If repeats < 1.
     """
-    checks.instance("task", task, Task)
-    repeats = checks.count("repeats", repeats)
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
         keys = jax.random.split(checks.key("key", key), repeats)
@@ -125,6 +125,7 @@ def average_repeats(task: Task, repeats: int) -> Task:
     return dataclasses.replace(task, rollout=rollout)
 
 
+@checks.arguments
 def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
     """Let theta be free and squash it into [low, high] (Abdolmaleki et al. 2016, Eq. 17).
 
@@ -148,6 +149,7 @@ def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
     return dataclasses.replace(task, rollout=rollout)
 
 
+@checks.arguments
 def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | int) -> Task:
     """Charge a penalty where theta leaves [low, high] (the 1_p of Abdolmaleki et al. 2016, Eq. 18).
 
@@ -167,7 +169,7 @@ def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | in
     Raises:
         ValueError: If the bounds do not fit the task or each other, or the penalty is negative.
     """
-    low, high = _checked_bounds(task, low, high, may_be_infinite=True)
+    low, high = _checked_bounds(task, low, high, largest=math.inf)
     checks.number("penalty", penalty, least=0.0)
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
@@ -187,11 +189,10 @@ def _mean_of_repeats(field: Array) -> Array:
 
 
 def _checked_bounds(
-    task: Task, low: VectorLike, high: VectorLike, *, may_be_infinite: bool = False
+    task: Task, low: VectorLike, high: VectorLike, *, largest: float = checks.FLOAT32_MAX
 ) -> tuple[np.ndarray, np.ndarray]:
-    checks.instance("task", task, Task)
     low, high = (
-        checks.vector(name, end, may_be_infinite=may_be_infinite).astype(np.float32)
+        checks.vector(name, end, largest=largest).astype(np.float32)
         for name, end in (("low", low), ("high", high))
     )
     shape = (task.theta_dim,)

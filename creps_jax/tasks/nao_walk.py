@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax import lax
 
 from creps_jax import checks
@@ -148,6 +149,7 @@ def load_nao() -> mujoco.MjModel:
     raise FileNotFoundError(f"nao/nao.xml is in none of {', '.join(map(str, folders))}")
 
 
+@checks.arguments
 def nao_walk(
     low: float = 0.1,
     high: float = 0.6,
@@ -193,26 +195,22 @@ def nao_walk(
 
     Source: Abdolmaleki et al. 2016, Section 4.3.
     """
-    _check_settings(reward, noise, balance, physics)
-    for name, value in (("low", low), ("high", high), ("duration", duration), ("start_up", start_up)):
-        checks.number(name, value)
-    if not low < high:
-        raise ValueError(f"low must be below high, got {low} and {high}")
-    if duration > _LONGEST:
-        raise ValueError(f"duration must be at most {_LONGEST:g} s, got {duration}")
+    checks.ends(low, high)
+    _check_numbers("reward", reward)
     if not 0 <= start_up < duration:
         raise ValueError(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
         )
-    check_conditions(conditions, duration)
+    begin, advance = _make_walker(model, duration, noise, balance, physics, conditions)
     if sample_context is None:
         lows, highs = [low, *(c.low for c in conditions)], [high, *(c.high for c in conditions)]
         sample_context = gaussian_contexts(lows, highs, clip=True)
-    begin, advance = _make_walker(model, duration, noise, balance, physics, conditions)
     num_ticks = round(duration / CONTROL_PERIOD)
     start_up_ticks = round(start_up / CONTROL_PERIOD)
 
+    @checks.arguments
     def rollout(key: PRNGKey, context: Float[Array, " s"], theta: Float[Array, "10"]) -> WalkOutcome:
+        context = checks.array("context", context, (1 + len(conditions),))
         walk = begin(key, theta, context[1:])
         start = _Progress(jnp.int32(0), walk.robot, walk.set_point, walk.robot.qpos[:2], jnp.asarray(False))
 
@@ -240,6 +238,7 @@ def nao_walk(
     return Task(sample_context, rollout, 1 + len(conditions), theta_dim=len(PARAM_NAMES), worst_reward=worst)
 
 
+@checks.arguments
 def record_walk(
     key: PRNGKey,
     theta: Float[Array, "10"],
@@ -248,7 +247,7 @@ def record_walk(
     noise: WalkNoise = WalkNoise(),
     balance: Balance = Balance(),
     conditions: Sequence[Condition] = (),
-    values: Float[Array, " k"] | None = None,
+    values: Float[Array, " k"] | Float[np.ndarray, " k"] | None = None,
     model: mujoco.MjModel | None = None,
     physics: Physics = mjx.make_control_step,
 ) -> WalkRecord:
@@ -288,7 +287,13 @@ def record_walk(
 
 
 def _make_walker(model, duration, noise, balance, physics, conditions=()):
-    """Return `begin(key, theta, values)` and `advance(walk, tick, robot, set_point)`."""
+    """Check settings; return `begin(key, theta, values)` and `advance(walk, tick, robot, set_point)`."""
+    if not CONTROL_PERIOD <= duration <= _LONGEST:
+        raise ValueError(f"duration must be {CONTROL_PERIOD} to {_LONGEST:g} s, got {duration}")
+    _check_numbers("noise", noise, least=0.0)
+    _check_numbers("balance", balance)
+    check_conditions(conditions, duration)
+    checks.function("physics", physics, "(model, number of steps) -> control step")
     model = load_nao() if model is None else model
     _check_model(model)
     control_step = physics(model, round(CONTROL_PERIOD / model.opt.timestep))
@@ -364,21 +369,13 @@ def _has_fallen(qpos: Array, circumstances: Circumstances | None) -> Array:
     return ~(is_high & (cosine > _FALLEN_COSINE))
 
 
-def _check_settings(reward: WalkReward, noise: WalkNoise, balance: Balance, physics: Physics) -> None:
-    for name, record, kind, least in (
-        ("reward", reward, WalkReward, -math.inf),
-        ("noise", noise, WalkNoise, 0.0),
-        ("balance", balance, Balance, -math.inf),
-    ):
-        checks.instance(name, record, kind)
-        for field, value in record._asdict().items():
-            checks.number(f"{name}.{field}", value, least=least)
-    checks.function("physics", physics, "(model, number of steps) -> control step")
+def _check_numbers(name: str, record: NamedTuple, *, least: float = -math.inf) -> None:
+    for field, value in record._asdict().items():
+        checks.number(f"{name}.{field}", value, least=least)
 
 
 def _check_model(model: mujoco.MjModel) -> None:
     """Refuse a model with other actuators, or with a time step that does not divide a control step."""
-    checks.instance("model", model, mujoco.MjModel)
     names = tuple(model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu))
     if names != JOINT_NAMES:
         raise ValueError(f"the model's actuators must drive {JOINT_NAMES} in this order, got {names}")

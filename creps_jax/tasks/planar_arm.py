@@ -50,6 +50,7 @@ class HoleOutcome(NamedTuple):
     distance: Float[Array, ""]
 
 
+@checks.arguments
 def via_point_reaching(
     low: VectorLike = (-1.5, -1.5),
     high: VectorLike = (-0.5, -0.5),
@@ -79,11 +80,10 @@ def via_point_reaching(
         raise ValueError(f"low must have two entries, of x and y, got {checks.shown(low)}")
     default = gaussian_contexts(low, high, clip=True)
     sample_context = default if sample_context is None else sample_context
-    theta_dim = NUM_BASIS * NUM_LINKS
 
+    @checks.arguments
     def rollout(key: PRNGKey, context: Float[Array, "2"], theta: Float[Array, "15"]) -> PlainOutcome:
         del key
-        context, theta = checks.array("context", context, (2,)), checks.array("theta", theta, (theta_dim,))
         movement = via_point_movement(theta)
         tips = jax.vmap(arm_points)(movement.pos)[:, -1]
         miss = jnp.sum(jnp.square(tips[_VIA_STEP - 1] - context))
@@ -91,9 +91,10 @@ def via_point_reaching(
         reward = -1e4 * miss - 0.5 * jnp.sum(jnp.square(movement.acc))
         return PlainOutcome(reward, jnp.zeros(0, theta.dtype))
 
-    return Task(sample_context, rollout, context_dim=2, theta_dim=theta_dim, worst_reward=-1e7)
+    return Task(sample_context, rollout, context_dim=2, theta_dim=NUM_BASIS * NUM_LINKS, worst_reward=-1e7)
 
 
+@checks.arguments
 def hole_reaching(
     low: float = 1.4,
     high: float = 2.0,
@@ -126,17 +127,14 @@ def hole_reaching(
     Source: Abdolmaleki et al. 2016, Section 4.2; the weights 1e5 and 10, and the length of a step, are those
     of its author's published settings.
     """
-    checks.number("low", low)
-    checks.number("high", high)
     checks.number("width", width, above=0.0)
     checks.number("depth", depth, above=0.0)
     default = gaussian_contexts(low, high, clip=True)
     sample_context = default if sample_context is None else sample_context
-    theta_dim = (NUM_BASIS + 1) * NUM_LINKS
 
+    @checks.arguments
     def rollout(key: PRNGKey, context: Float[Array, "1"], theta: Float[Array, "18"]) -> HoleOutcome:
         del key
-        context, theta = checks.array("context", context, (1,)), checks.array("theta", theta, (theta_dim,))
         movement = hole_movement(theta)
         points = jax.vmap(arm_points)(movement.pos)
         hits = jax.vmap(lambda posture: hits_ground(posture, context[0], width, depth))(points)
@@ -148,19 +146,23 @@ def hole_reaching(
         reward = -1e5 * (missed + num_collisions) - 10.0 * jnp.sum(jnp.square(movement.acc))
         return HoleOutcome(reward, jnp.zeros(0, theta.dtype), num_collisions, jnp.sqrt(last))
 
+    theta_dim = (NUM_BASIS + 1) * NUM_LINKS
     return Task(sample_context, rollout, context_dim=1, theta_dim=theta_dim, worst_reward=-1e8)
 
 
+@checks.arguments
 def via_point_movement(theta: Float[Array, "15"]) -> DmpTrajectory:
     """Return the joints' movement in `via_point_reaching`, rad and s."""
     return _movement(theta, jnp.array(_STRETCHED, theta.dtype))
 
 
+@checks.arguments
 def hole_movement(theta: Float[Array, "18"]) -> DmpTrajectory:
     """Return the joints' movement in `hole_reaching`, rad and s."""
     return _movement(theta[:-NUM_LINKS], theta[-NUM_LINKS:])
 
 
+@checks.arguments
 def arm_points(joint_pos: Float[Array, " k"]) -> Float[Array, "k+1 2"]:
     """Return the ends of the links of 1 m, from the base at the origin to the end effector.
 
@@ -175,6 +177,7 @@ def arm_points(joint_pos: Float[Array, " k"]) -> Float[Array, "k+1 2"]:
     return jnp.concatenate([jnp.zeros((1, 2), ends.dtype), ends])
 
 
+@checks.arguments
 def hits_ground(
     points: Float[Array, "n 2"], center: Scalar, width: ScalarLike, depth: ScalarLike
 ) -> Bool[Array, ""]:
@@ -205,8 +208,6 @@ def hits_ground(
 
 
 def _movement(weights: Array, goal: Array) -> DmpTrajectory:
-    if weights.size != NUM_BASIS * NUM_LINKS or goal.size != NUM_LINKS:
-        raise ValueError(f"theta has the wrong size: {weights.size} weights and {goal.size} goals")
     start = jnp.array(_START, goal.dtype)
     return dmp_trajectory(
         weights.reshape(NUM_BASIS, NUM_LINKS), start, goal, duration=DURATION, num_steps=NUM_STEPS

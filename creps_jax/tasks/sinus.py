@@ -12,6 +12,7 @@ from creps_jax.typing import Array, Float, PRNGKey
 __all__ = ["sinus"]
 
 
+@checks.arguments
 def sinus(low: float = 0.0, high: float = 5 * math.pi) -> Task:
     """Ask for theta = sin(context), with reward -(theta - sin s)^2.
 
@@ -31,12 +32,10 @@ def sinus(low: float = 0.0, high: float = 5 * math.pi) -> Task:
 
     Source: Abdolmaleki et al. 2016, Section 4.1 and Fig. 5 (the reward is printed without its minus).
     """
-    checks.number("low", low)
-    checks.number("high", high)
 
+    @checks.arguments
     def rollout(key: PRNGKey, context: Float[Array, " 1"], theta: Float[Array, " 1"]) -> PlainOutcome:
         del key  # The task has no noise.
-        context, theta = checks.array("context", context, (1,)), checks.array("theta", theta, (1,))
         reward = -jnp.square(theta[0] - jnp.sin(context[0]))
         return PlainOutcome(reward=reward, violation=jnp.zeros(0))
 

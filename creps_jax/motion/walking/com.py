@@ -12,6 +12,7 @@ from creps_jax.typing import Array, Float, Scalar, ScalarLike
 __all__ = ["com_trajectory", "spring_height", "zmp_of_com"]
 
 
+@checks.arguments
 def spring_height(
     phase: Float[Array, "*n"], rest_height: Scalar, amplitude: Scalar, duration: Scalar
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
@@ -39,6 +40,7 @@ def _neighbour_weight(com_height, com_height_acc, duration):
     return -com_height / ((GRAVITY + com_height_acc) * period**2)
 
 
+@checks.arguments
 def com_trajectory(
     zmp: Float[Array, " n"],
     com_height: Float[Array, " n"],
@@ -67,19 +69,10 @@ def com_trajectory(
 
     Source: Abdolmaleki et al. 2016, Eq. 1, 5-9, with the signs of Eq. 1.
     """
-    zmp = checks.array("zmp", zmp)
-    com_height = checks.array("com_height", com_height)
-    com_height_acc = checks.array("com_height_acc", com_height_acc)
-    shapes = [zmp.shape, com_height.shape, com_height_acc.shape]
-    if len(set(shapes)) != 1 or zmp.ndim != 1 or zmp.shape[0] < 3:
-        raise ValueError(
-            "com_trajectory needs zmp, com_height and com_height_acc to be vectors of one length n >= 3, "
-            f"got shapes {shapes}"
-        )
+    if len(zmp) < 3:
+        raise ValueError(f"zmp must have three nodes or more, got {len(zmp)}")
     checks.finite("com_height", com_height, above=0.0)
     checks.finite("com_height_acc", com_height_acc, above=-GRAVITY)
-    checks.number("start", start)
-    checks.number("end", end)
     checks.number("duration", duration, above=0.0)
     weight = _neighbour_weight(com_height, com_height_acc, duration)
     # First and last row say x(1) = start and x(n) = end.
@@ -90,6 +83,7 @@ def com_trajectory(
     return thomas_solve(neighbour, 1.0 - 2.0 * neighbour, neighbour, rhs)
 
 
+@checks.arguments
 def zmp_of_com(
     com: Float[Array, " n"],
     com_height: Float[Array, " n"],

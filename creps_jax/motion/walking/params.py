@@ -109,6 +109,7 @@ class WalkParams(NamedTuple):
     step_growth: Scalar
 
 
+@checks.arguments
 def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
     """Turn a parameter vector in the paper's order and units into settings that the engine can plan with.
 
@@ -125,7 +126,6 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
     Raises:
         ValueError: If theta has not one entry for each parameter.
     """
-    theta = checks.array("theta", theta, (len(PARAM_NAMES),))
     safe = jnp.clip(theta, jnp.asarray(_SAFE_LOW, theta.dtype), jnp.asarray(_SAFE_HIGH, theta.dtype))
     params = WalkParams(*safe)
     duration = params.step_duration
@@ -137,6 +137,7 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
     )
 
 
+@checks.arguments
 def count_steps(duration: float) -> int:
     """Return how many steps at most a walk can have, with any parameters of `params_from_theta`.
 
