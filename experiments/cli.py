@@ -64,7 +64,7 @@ class Run:
         seed: Seed of all random numbers; 0 by default.
         out: Result folder; a new one in results/ by default.
         resume: Go on with the run in the folder --out, or with the latest unfinished one.
-        physics: What steps the robot: mjx, or c, which starts sooner (walk and fig11_walk only).
+        physics: What steps the robot: mjx, c, or auto: c on a CPU, elsewhere mjx (walks only).
         distributed: This is one of several processes, on one host or many, that share the run; see
             docs/several_machines.md.
         speed: Learn nothing and show one walk at this speed in m/s (walk only).

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -18,6 +19,7 @@ from creps_jax.features import quadratic_features
 from creps_jax.motion.walking.params import NAO_BOUNDS, PAPER_BOUNDS, PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c, mjx
+from creps_jax.physics.state import ControlStep
 from creps_jax.policy import LinearGaussian
 from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constrained
 from creps_jax.tasks.conditions import Condition
@@ -33,10 +35,17 @@ from experiments.walking_policy import POLICY, START_UP, record, save_film
 BOUNDS = {"nao": NAO_BOUNDS, "paper": PAPER_BOUNDS}
 SAMPLERS = {"gaussian": partial(gaussian_contexts, clip=True), "uniform": uniform_contexts}
 CONSTRAINTS = ("sigmoid", "penalty")
-PHYSICS = {"mjx": mjx.make_control_step, "c": c.make_control_step}
 PENALTY = 1000.0
 FILMED_SPEEDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 TIMESTEP = 0.004
+
+
+def _fastest(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
+    """Choose what steps the robot: C MuJoCo on a CPU, where it starts sooner and is faster, elsewhere MJX."""
+    return (c if jax.default_backend() == "cpu" else mjx).make_control_step(model, num_substeps)
+
+
+PHYSICS = {"auto": _fastest, "mjx": mjx.make_control_step, "c": c.make_control_step}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,8 +82,8 @@ class Settings:
         learning_noise: how many times larger the noise is in learning than in the evaluation: a policy
             that has learned to stay up in more of it falls less.
         eval_seeds: fresh episodes at each speed of the table.
-        physics: what steps the robot, a name in PHYSICS: MJX, or C MuJoCo on the host's cores, which compiles
-            sooner and on a CPU is somewhat faster.
+        physics: what steps the robot, a name in PHYSICS: MJX on the device, C MuJoCo on the host's cores, or
+            the faster of them.
     """
 
     iterations: int = 300
@@ -101,7 +110,7 @@ class Settings:
     margin: float = 0.0
     learning_noise: float = 1.0
     eval_seeds: int = 10
-    physics: str = "mjx"
+    physics: str = "auto"
 
     def __post_init__(self) -> None:
         # Settings that come back from a manifest are plain.

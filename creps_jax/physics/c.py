@@ -30,7 +30,8 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
 
     It does what `creps_jax.physics.mjx.make_control_step` does, but for rounding. A `jax.vmap` of it is one
     call for the whole batch. A robot whose state or set-points are not finite, or that C MuJoCo finds
-    unstable (which it also writes to its log, MUJOCO_LOG.TXT), gets a state of NaN. There are no gradients.
+    unstable (which it also writes to its log, MUJOCO_LOG.TXT), gets a state of NaN, and one that has such a
+    state takes no time. There are no gradients.
 
     Args:
         model: A model all of whose actuators are position servos on joints.
@@ -44,13 +45,13 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     """
     shares = substep_shares(num_substeps)[:, None]
     lead = read_servos(model).lead
-    rest = np.append(model.qpos0, np.zeros(model.nv))
     # Devices call at the same time, each from threads that come and go.
     idle = []
 
     def make():
         data = [mujoco.MjData(model) for _ in range(_threads())]
-        return _Tools(rollout.Rollout(nthread=len(data)), data, [])
+        # Without a thread of its own, a pool works in the one that calls.
+        return _Tools(rollout.Rollout(nthread=len(data) if len(data) > 1 else 0), data, [])
 
     world_sizes = tuple(np.size(leaf) for leaf in world_of(model))
     sizes = (model.nq, model.nv, model.nv, model.nu, model.nu, model.nu)
@@ -60,21 +61,35 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
         qpos, qvel, warmstart, before, after, speed, worlds = np.split(rows, np.cumsum(sizes), axis=1)
         control = before[:, None] + shares * (after - before)[:, None] + (lead * speed)[:, None]
         start = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
-        is_lost = ~((np.abs(start) <= _LARGEST).all(axis=1) & np.isfinite(control).all(axis=(1, 2)))
-        for array, stand_in in ((start, np.append(0.0, rest)), (control, 0.0), (warmstart, 0.0)):
-            array[is_lost] = stand_in
+        moved = np.full((len(rows), sum(sizes[:3])), np.nan, np.float32)
+        is_sound = (np.abs(start) <= _LARGEST).all(axis=1) & np.isfinite(control).all(axis=(1, 2))
+        if not is_sound.any():
+            return moved.reshape(*packed.shape[:-1], -1)
+        start, control, warmstart, qvel, worlds = (
+            array[is_sound] for array in (start, control, warmstart, qvel, worlds)
+        )
         with _borrowed(idle, make) as (pool, data, copies):
-            models = _models(model, copies, worlds, world_sizes) if worlds.size else model
-            states, _ = pool.rollout(models, data, start, control, initial_warmstart=warmstart)
+            models = _models(model, copies, worlds, world_sizes) if worlds.size else [model] * len(start)
+            states = np.empty((len(start), num_substeps, start.shape[1]))
+            pool.rollout(
+                models,
+                data,
+                start,
+                control,
+                skip_checks=True,
+                nstep=num_substeps,
+                initial_warmstart=warmstart,
+                state=states,
+            )
         # C stands a robot up again whose state has become bad, with a new time, and leaves it there.
-        is_lost |= states[:, -1, 0] < (num_substeps - 0.5) * model.opt.timestep
+        is_lost = states[:, -1, 0] < (num_substeps - 0.5) * model.opt.timestep
         is_lost |= ~(np.abs(states[:, -1]) <= _LARGEST).all(axis=1)
         states[is_lost] = np.nan
         end = states[:, -1, 1 + model.nq :]
         # The solver starts near the last acceleration; what the velocities tell of it is a good guess.
         earlier = states[:, -2, 1 + model.nq :] if num_substeps > 1 else qvel
-        moved = [states[:, -1, 1:], (end - earlier) / model.opt.timestep]
-        return np.concatenate(moved, axis=1, dtype=np.float32).reshape(*packed.shape[:-1], -1)
+        moved[is_sound] = np.concatenate([states[:, -1, 1:], (end - earlier) / model.opt.timestep], axis=1)
+        return moved.reshape(*packed.shape[:-1], -1)
 
     def control_step(
         state: RobotState,

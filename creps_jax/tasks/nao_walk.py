@@ -218,7 +218,9 @@ def nao_walk(
             return (progress.tick < num_ticks) & ~progress.has_fallen
 
         def step(progress):
-            robot, set_point = advance(walk, progress.tick, progress.robot, progress.set_point)
+            # A batch goes on until its last robot has fallen; a state of NaN spares C MuJoCo the others.
+            robot = jax.tree.map(lambda x: jnp.where(progress.has_fallen, jnp.nan, x), progress.robot)
+            robot, set_point = advance(walk, progress.tick, robot, progress.set_point)
             tick = progress.tick + 1
             is_start_up = tick <= start_up_ticks
             measured_from = lax.select(is_start_up, robot.qpos[:2], progress.measured_from)

@@ -3,7 +3,8 @@
     python -m experiments.benchmarks.rollouts
 
 Each round runs all in turn; the ratios are medians over the rounds. Ours have the controller in the loop; C
-MuJoCo replays the set-points of such a walk with `mujoco.rollout`, one thread a core. What C gains from all
+MuJoCo replays what it told the servos in as many such walks, noise and all (without noise the solver has less
+to do), with `mujoco.rollout`, one thread a core, whole walks at once. What C gains from all
 threads over one tells how far this machine scales at all: cores that share a chip with others slow down
 when all are busy.
 """
@@ -13,6 +14,7 @@ from experiments.process import import_mjx_quietly, prepare, usable_cores
 prepare()
 import_mjx_quietly()
 
+import functools  # noqa: E402
 import time  # noqa: E402
 from collections.abc import Callable  # noqa: E402
 
@@ -21,8 +23,10 @@ import jax.numpy as jnp  # noqa: E402
 import mujoco  # noqa: E402
 import mujoco.rollout  # noqa: E402
 import numpy as np  # noqa: E402
+from jax.experimental import io_callback  # noqa: E402
 
 from creps_jax.physics import c, mjx  # noqa: E402
+from creps_jax.physics.state import ControlStep  # noqa: E402
 from creps_jax.tasks.nao_walk import CONTROL_PERIOD, Physics, load_nao, nao_walk, record_walk  # noqa: E402
 from creps_jax.train import evaluate  # noqa: E402
 from experiments.walk import SETTINGS  # noqa: E402
@@ -79,25 +83,48 @@ def _ours(devices: list[jax.Device], physics: Physics = mjx.make_control_step) -
 
 
 def _bare_c(model: mujoco.MjModel, threads: int) -> Callable[[], None]:
-    record = jax.jit(lambda key: record_walk(key, jnp.array(THETA), duration=DURATION, balance=BALANCE))
-    walk = jax.tree.map(np.asarray, record(jax.random.key(0)))
+    start, told = _told()
     data = [mujoco.MjData(model) for _ in range(threads)]
-    data[0].qpos[:] = walk.qpos[0]
-    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    state = np.empty(size)
-    mujoco.mj_getState(model, data[0], state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    states = np.concatenate([np.zeros((BATCH, 1)), start, np.zeros((BATCH, model.nv))], axis=1)
     substeps = round(CONTROL_PERIOD / model.opt.timestep)
     shares = np.arange(1, substeps + 1)[:, None] / substeps
-    before = np.concatenate([walk.set_point[:1], walk.set_point[:-1]])[:, None]
-    change = walk.set_point[:, None] - before
-    lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] / CONTROL_PERIOD
-    control = (before + (shares + lead) * change).reshape(-1, model.nu)
+    lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0]
+    before, after, speed = np.split(told[:, :, None], 3, axis=-1)
+    controls = (before + shares * (after - before) + lead * speed).reshape(BATCH, -1, model.nu)
 
     def run() -> None:
-        states, controls = np.tile(state, (BATCH, 1)), np.tile(control, (BATCH, 1, 1))
         mujoco.rollout.rollout(model, data, states, controls)
 
     return run
+
+
+@functools.cache
+def _told() -> tuple[np.ndarray, np.ndarray]:
+    """Walk, and note where each robot starts (BATCH, nq) and what servos are told (BATCH, ticks, 3 nu)."""
+    noted = []
+
+    def noting(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
+        step = c.make_control_step(model, num_substeps)
+
+        def control_step(robot, before, after, speed):
+            row = jnp.concatenate([robot.qpos, before, after, speed])
+            io_callback(lambda row: noted.append(np.array(row)), None, row, ordered=True)
+            return step(robot, before, after, speed)
+
+        return control_step
+
+    def walk(key: jax.Array) -> jax.Array:
+        theta = jnp.array(THETA)
+        return record_walk(key, theta, duration=DURATION, balance=BALANCE, physics=noting).has_fallen.any()
+
+    # One robot after the other: what is noted is in order. One device, as ordered callbacks want it.
+    with jax.default_device(jax.devices()[0]):
+        keys = jax.random.split(jax.random.key(0), BATCH)
+        assert not jax.jit(lambda keys: jax.lax.map(walk, keys))(keys).any(), "a robot of the benchmark fell"
+        jax.effects_barrier()
+    rows = np.stack(noted).reshape(BATCH, round(DURATION / CONTROL_PERIOD), -1)
+    qpos, told = np.split(rows, [load_nao().nq], axis=-1)
+    return qpos[:, 0], told
 
 
 if __name__ == "__main__":

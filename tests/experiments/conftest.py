@@ -1,4 +1,4 @@
-"""Make a small experiment known, and compile quickly."""
+"""Make a small experiment known, and updates that compile quickly."""
 
 import dataclasses
 import sys
@@ -12,14 +12,6 @@ from creps_jax.archive import push
 from creps_jax.creps import CrepsState, creps
 from experiments import comparison, registry, walk
 from tests.experiments import tiny as small
-
-
-@pytest.fixture(autouse=True)
-def compiled_quickly():
-    """Compile in half the time what then runs slower: here experiments run for a few iterations."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 @pytest.fixture

@@ -25,13 +25,7 @@ def start(out, num_devices, *arguments, **environment):
     command = [sys.executable, "-m", "tests.experiments.tiny", "run", "tiny", "--trials", "3"]
     return subprocess.Popen(
         [*command, "--out", str(out), *arguments],
-        env=os.environ
-        | {
-            "PYTHONPATH": str(ROOT),
-            "JAX_NUM_CPU_DEVICES": str(num_devices),
-            "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-        }
-        | environment,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "JAX_NUM_CPU_DEVICES": str(num_devices)} | environment,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
