@@ -371,7 +371,7 @@ def _has_fallen(qpos: Array, circumstances: Circumstances | None) -> Array:
     return ~(is_high & (cosine > _FALLEN_COSINE))
 
 
-def _check_numbers(name: str, record: NamedTuple, *, least: float = -math.inf) -> None:
+def _check_numbers(name: str, record: WalkReward | WalkNoise | Balance, *, least: float = -math.inf) -> None:
     for field, value in record._asdict().items():
         checks.number(f"{name}.{field}", value, least=least)
 

@@ -84,11 +84,11 @@ COMMANDS = {
     "export": st.one_of(
         option("export", "--to", values=NO_EXPORTS),
         option("export", "--to", "p.h", "--policy", values=NO_POLICIES),
-        option("export", "--to", "p.h", "--speed", values=st.just("0.3")),
+        st.just((["export", "--to", "p.h", "--speed", "0.3"], "--speed")),
         option("export", "--to", "w.csv", "--policy", "whole.npz", "--speed", values=NO_SPEEDS),
         option(
             *("export", "--to", "w.csv", "--policy", "whole.npz", "--speed", "0.3", "--duration"),
-            values=NO_NUMBERS | st.just("1e9"),
+            values=NO_NUMBERS | st.just("1000000000.0"),
         ),
     ),
     "session new": st.one_of(
@@ -109,7 +109,7 @@ COMMANDS = {
         option("session", "ask", "arm", "--more", "1", "--context", values=NO_NUMBERS),
         option("session", "status", values=NO_SESSIONS),
         option("session", "tell", "arm", "--broken", values=WORDS | st.sampled_from(["0", "-1", "4", "1e3"])),
-        option("session", "tell", "arm", "1", "--reward", values=WORDS | st.sampled_from(["inf", "1e39"])),
+        option("session", "tell", "arm", "1", "--reward", values=WORDS | st.sampled_from(["inf", "1e+39"])),
         st.just((["session", "tell", "arm", "1"], "--reward")),
         st.just((["session", "tell", "arm", "1", "--reward", "1", "--broken"], "--broken")),
         option("session", "save", "--to", "p.npz", values=NO_SESSIONS),
