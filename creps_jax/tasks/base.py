@@ -21,7 +21,6 @@ __all__ = [
     "PlainOutcome",
     "Task",
     "average_repeats",
-    "check_outcome",
     "penalised",
     "sigmoid_constrained",
 ]

@@ -301,9 +301,9 @@ def _make_walker(model, duration, noise, balance, physics, conditions=()):
     control_step = physics(model, round(CONTROL_PERIOD / model.opt.timestep))
     num_ticks = round(duration / CONTROL_PERIOD)
 
-    def begin(key: PRNGKey, theta: Array, values: Array | None = None) -> _Walk:
+    def begin(key: PRNGKey, theta: Array, values: Array | np.ndarray | None = None) -> _Walk:
         start_key, lean_key, set_point_key = jax.random.split(key, 3)
-        values = jnp.zeros(0, theta.dtype) if values is None else values
+        values = jnp.zeros(0, theta.dtype) if values is None else checks.array("values", values)
         circumstances = circumstances_of(conditions, values, world_of(model))
         params = params_from_theta(theta)
         plans = plan_walk(params, count_steps(duration))
