@@ -30,10 +30,18 @@ from creps_jax.rollouts import (
 from creps_jax.tasks.base import Task
 from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
 
-__all__ = ["IterationLog", "evaluate", "make_iteration", "train", "train_trials"]
+__all__ = ["IterationLog", "Samples", "evaluate", "make_iteration", "train", "train_trials"]
 
 OnIteration = Callable[[CrepsState, "IterationLog"], Any]
 """Called as (state, log) after an iteration; what it returns is not used."""
+
+
+class Samples(NamedTuple):
+    """The new samples of an iteration, in the order in which they were drawn (leading axis n)."""
+
+    context: Float[Array, "n s"]
+    outcome: Any
+    """The task's outcomes; rewards that were not finite are the task's worst."""
 
 
 class IterationLog(NamedTuple):
@@ -47,6 +55,8 @@ class IterationLog(NamedTuple):
     outcome: Any
     """Mean of each field of the task's outcome over the new samples that did not fail: of a boolean
     the fraction. NaN if all failed."""
+    samples: Samples | None = None
+    """The new samples; None in the logs of several iterations, which may differ in their number."""
 
 
 @checks.arguments
@@ -106,7 +116,8 @@ def train(
         samples: Number of new samples of each iteration.
         first_samples: Number of new samples of the very first iteration of a run, if it differs.
         on_iteration: Called on the host as (state, log) after each iteration, for progress and
-            checkpoints. Without it all iterations are one `lax.scan`, with the same numbers.
+            checkpoints; this log holds the samples too. Without it all iterations are one `lax.scan`, with
+            the same numbers.
         devices: Devices that share the rollouts, by default all local ones.
 
     Returns:
@@ -248,6 +259,7 @@ def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState
         mean_reward=jnp.mean(outcomes.reward),
         num_failed=jnp.sum(is_failed, dtype=jnp.int32),
         outcome=mean_outcome(outcomes, ~is_failed),
+        samples=Samples(contexts, outcomes),
     )
     return lax.optimization_barrier((state, log))
 
@@ -275,7 +287,11 @@ def _shares_trials(setup: _Setup, num_trials: int) -> bool:
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _scan(iterate: Callable, setup: _Setup, length: int, key: Array, state: CrepsState):
-    return lax.scan(lambda state, _: iterate(setup, key, state), state, length=length)
+    def step(state: CrepsState, _: None) -> tuple[CrepsState, IterationLog]:
+        state, log = iterate(setup, key, state)
+        return state, log._replace(samples=None)
+
+    return lax.scan(step, state, length=length)
 
 
 def _phases(
@@ -312,7 +328,7 @@ def _run(
             continue
         for _ in range(length):
             state, log = iterate(setup, key, state)
-            logs.append(jax.tree.map(lambda x: x[None], jax.device_get(log)))
+            logs.append(jax.tree.map(lambda x: x[None], jax.device_get(log._replace(samples=None))))
             if on_iteration is not None:
                 on_iteration(state, log)
     return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)

@@ -37,6 +37,9 @@ Results go to results/. Add --help to any of these for all its options.
 """
 
 
+INTERRUPTED = 130
+"""The exit code of a command that Ctrl-C ended."""
+
 # Options that are left out are described in words, not as "None".
 _Name = Annotated[str, arg(metavar="NAME")]
 _Names = Annotated[tuple[str, ...], arg(metavar="[NAME ...]", help_behavior_hint="")]
@@ -172,7 +175,7 @@ def main(arguments: Sequence[str]) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
 
 
 def _say(line: str) -> None:

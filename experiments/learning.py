@@ -15,10 +15,10 @@ from creps_jax.creps import Creps, CrepsState
 from creps_jax.mstep import MStep, bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
 from creps_jax.tasks.base import Task
-from creps_jax.train import train_trials
+from creps_jax.train import Samples, train_trials
 from experiments.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
 from experiments.errors import UserError
-from experiments.progress import Progress, Row
+from experiments.progress import PooledSamples, Progress, Row
 
 _SECONDS_BETWEEN_CHECKPOINTS = 2.0
 
@@ -128,9 +128,10 @@ def learn(
             save_checkpoint(path, checkpoint, run=identity)
 
     keeper = _Keeper(latest, save)
-    done = len(latest.log["mean_reward"]) if latest.log else 0
+    earlier = latest.log["mean_reward"].mean(axis=1) if latest.log else np.zeros(0)
+    done = len(earlier)
     if done < plan.iterations:
-        with _Reporter(name, plan, done=done, console=session.console) as report, keeper:
+        with _Reporter(name, plan, earlier=earlier, console=session.console) as report, keeper:
 
             def on_iteration(state: CrepsState, log: Any) -> None:
                 keeper.take(state, log)
@@ -170,7 +171,7 @@ class _Keeper:
 
     def take(self, state: CrepsState, log: Any) -> None:
         # One assignment: an interrupt finds the iteration either here whole or not at all.
-        row = {**named_leaves(log), "coef": np.asarray(state.policy.coef)}
+        row = {**named_leaves(log._replace(samples=None)), "coef": np.asarray(state.policy.coef)}
         self.latest = Checkpoint(state, append_log(self.latest.log, row))
         if time.monotonic() - self._saved_at >= _SECONDS_BETWEEN_CHECKPOINTS:
             self._write()
@@ -183,12 +184,16 @@ class _Keeper:
 class _Reporter:
     """Turn the logs of iterations into rows of progress."""
 
-    def __init__(self, name: str, plan: Plan, *, done: int, console: Console | None):
-        self._plan, self._done = plan, done
+    def __init__(self, name: str, plan: Plan, *, earlier: np.ndarray, console: Console | None):
+        self._plan, self._done = plan, len(earlier)
         self._progress = None
         if console is not None:
             self._progress = Progress(
-                f"learning {name}", plan.iterations, done=done, timestep=plan.timestep, console=console
+                f"learning {name}",
+                plan.iterations,
+                earlier=earlier.tolist(),
+                timestep=plan.timestep,
+                console=console,
             )
 
     def __enter__(self) -> Callable[[Any], None]:
@@ -215,5 +220,21 @@ class _Reporter:
             fall_share=None if fell is None else float(np.mean(fell)),
             kl=float(np.mean(log.info.kl)),
             simulated_seconds=None if seconds is None else float(np.mean(seconds)) * new,
+            samples=pooled(log.samples),
         )
         self._progress.update(row)
+
+
+def pooled(samples: Samples) -> PooledSamples:
+    """Return the new samples (trials, n, ...) of all trials as the progress view takes them.
+
+    The outcome of a walk has its forward speed first, and its context the speed that was asked for.
+    """
+    outcome = samples.outcome
+    fell, speed = getattr(outcome, "fell", None), getattr(outcome, "speed", None)
+    return PooledSamples(
+        context=np.asarray(samples.context)[..., 0].ravel(),
+        reward=np.ravel(outcome.reward),
+        speed=None if speed is None else np.asarray(speed)[..., 0].ravel(),
+        fall_share=None if fell is None else np.asarray(fell, float).ravel(),
+    )

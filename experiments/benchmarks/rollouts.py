@@ -27,6 +27,7 @@ from jax.experimental import io_callback  # noqa: E402
 
 from creps_jax.physics import c, mjx  # noqa: E402
 from creps_jax.physics.state import ControlStep  # noqa: E402
+from creps_jax.tasks import Task  # noqa: E402
 from creps_jax.tasks.nao_walk import CONTROL_PERIOD, Physics, load_nao, nao_walk, record_walk  # noqa: E402
 from creps_jax.train import evaluate  # noqa: E402
 from experiments.walk import SETTINGS  # noqa: E402
@@ -72,9 +73,14 @@ def main() -> None:
         print(f"{one} / {other}: {np.median(np.divide(rates[one], rates[other])):.2f}")
 
 
+def walking_batch(size: int, duration: float, physics: Physics) -> tuple[Task, jax.Array, jax.Array]:
+    """Return the walking task with episodes of this duration, s, and contexts and parameters of a batch."""
+    task = nao_walk(duration=duration, start_up=duration / 4, balance=BALANCE, physics=physics)
+    return task, jnp.full((size, 1), 0.3), jnp.tile(jnp.array(THETA), (size, 1))
+
+
 def _ours(devices: list[jax.Device], physics: Physics = mjx.make_control_step) -> Callable[[], None]:
-    task = nao_walk(duration=DURATION, start_up=0.5, balance=BALANCE, physics=physics)
-    contexts, thetas = jnp.full((BATCH, 1), 0.3), jnp.tile(jnp.array(THETA), (BATCH, 1))
+    task, contexts, thetas = walking_batch(BATCH, DURATION, physics)
 
     def run() -> None:
         jax.block_until_ready(evaluate(jax.random.key(0), task, contexts, thetas, devices=devices))

@@ -168,7 +168,7 @@ def test_settings_come_back_from_a_manifest():
     assert walk.Settings(**dataclasses.asdict(settings)) == settings
 
 
-@pytest.mark.parametrize(("name", "known"), [("bounds", "nao, paper"), ("physics", "mjx, c")])
+@pytest.mark.parametrize(("name", "known"), [("bounds", "nao, paper"), ("physics", "auto, mjx, c")])
 def test_unknown_names_are_refused(name, known):
     with pytest.raises(UserError, match=f"{name} must be one of {known}, got 'moon'"):
         walk.Settings(**{name: "moon"})
@@ -181,7 +181,14 @@ def test_physics_is_what_is_asked_for(monkeypatch, name):
         walk, "nao_walk", lambda *bounds, **settings: asked.update(settings) or stand_in(*bounds, **settings)
     )
     walk.make_task(walk.Settings(physics=name))
-    assert asked["physics"] is {"mjx": mjx, "c": c}[name].make_control_step
+    assert asked["physics"] is walk.PHYSICS[name]
+
+
+@pytest.mark.parametrize(("platform", "module"), [("cpu", c), ("gpu", mjx)])
+def test_the_faster_physics_of_the_machine_are_chosen(monkeypatch, platform, module):
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    monkeypatch.setattr(module, "make_control_step", lambda model, num_substeps: (model, num_substeps))
+    assert walk.PHYSICS["auto"]("model", 5) == ("model", 5)
 
 
 @pytest.mark.usefixtures("relaxed_promotion")

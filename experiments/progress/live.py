@@ -1,4 +1,4 @@
-"""Show how a run is getting on: a live view in a terminal, a line every few seconds elsewhere."""
+"""Take in the iterations of a run, and show them."""
 
 import math
 import sys
@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from rich.console import Console, Group
+from rich.control import Control
 from rich.live import Live
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
+from rich.segment import ControlType
 
-_BLOCKS = "▁▂▃▄▅▆▇█"
-_ASCII_BLOCKS = "_.-=+*#@"
+from experiments.progress.by_context import PooledSamples, Recent
+from experiments.progress.view import View, draw
 
 
 class Row(NamedTuple):
@@ -26,6 +25,7 @@ class Row(NamedTuple):
         fall_share: share of the iteration's rollouts that fell; None where nothing can fall.
         kl: KL divergence of the sample weights.
         simulated_seconds: simulated time of the iteration; None where nothing is simulated.
+        samples: the iteration's samples; None where they are not known.
     """
 
     iteration: int
@@ -34,6 +34,7 @@ class Row(NamedTuple):
     fall_share: float | None = None
     kl: float | None = None
     simulated_seconds: float | None = None
+    samples: PooledSamples | None = None
 
 
 class Progress:
@@ -42,7 +43,7 @@ class Progress:
     Args:
         title: what is running.
         iterations: how many iterations the run has.
-        done: how many of them were done before, by a run that is resumed.
+        earlier: mean rewards of the iterations that were done before, by a run that is resumed.
         timestep: physics time step in seconds, to count steps a second; None where there is none.
         console: where to; by default stdout.
         every: seconds between two lines where there is no terminal.
@@ -53,20 +54,22 @@ class Progress:
         title: str,
         iterations: int,
         *,
-        done: int = 0,
+        earlier: Sequence[float] = (),
         timestep: float | None = None,
         console: Console | None = None,
         every: float = 5.0,
     ):
         self._title = title
         self._iterations = iterations
-        self._done = done
+        self._done = len(earlier)
         self._timestep = timestep
         self._console = console or Console(file=sys.stdout, highlight=False, soft_wrap=True)
         self._every = every
-        self._rewards: list[float] = []
+        self._rewards = list(earlier)
+        self._recent = Recent()
         self._row: Row | None = None
         self._live: Live | None = None
+        self._drawn: tuple[int, list[int]] = (0, [])
         self._started = self._first = self._last = self._printed = time.monotonic()
         self._iteration_seconds = math.nan
 
@@ -94,22 +97,25 @@ class Progress:
         self._iteration_seconds = now - self._last
         self._last, self._row = now, row
         self._rewards.append(row.mean_reward)
+        if row.samples is not None:
+            self._recent.add(row.samples)
         if self._live is None and (now - self._printed >= self._every or row.iteration == self._iterations):
             self._printed = now
             self._console.print("  ".join(f"{name} {value}" for name, value in self._cells()))
 
     def seconds_left(self) -> float:
         """Estimate the time left; NaN until two iterations have ended, as the first one compiles."""
-        if self._row is None or len(self._rewards) < 2:
+        counted = len(self._rewards) - self._done - 1
+        if self._row is None or counted < 1:
             return math.nan
-        mean = (self._last - self._first) / (len(self._rewards) - 1)
+        mean = (self._last - self._first) / counted
         return mean * (self._iterations - self._row.iteration)
 
     def _cells(self) -> list[tuple[str, str]]:
         row = self._row
         elapsed = ("elapsed", clock(time.monotonic() - self._started))
         if row is None:
-            return [("iteration", f"{self._done}/{self._iterations}"), elapsed]
+            return [("iteration", f"{self._done}/{self._iterations}"), elapsed, ("", "compiling ...")]
         cells = [
             ("iteration", f"{row.iteration}/{self._iterations}"),
             ("episodes", f"{row.episodes:,}"),
@@ -121,24 +127,29 @@ class Progress:
             cells.append(("KL", f"{row.kl:.3f}"))
         if row.simulated_seconds is not None and self._iteration_seconds > 0:
             speed = row.simulated_seconds / self._iteration_seconds
-            steps = f" ({speed / self._timestep:,.0f} steps/s)" if self._timestep else ""
-            cells.append(("simulation", f"{speed:,.0f} x real time{steps}"))
+            cells.append(("simulation", f"{speed:,.0f} x real time"))
+            if self._timestep:
+                cells.append(("steps/s", f"{speed / self._timestep:,.0f}"))
         return [*cells, elapsed, ("left", clock(self.seconds_left()))]
 
     def _render(self) -> Group:
-        grid = Table.grid(padding=(0, 2))
-        for name, value in self._cells():
-            grid.add_row(Text(name, style="dim"), Text(value))
+        width, height = self._console.size
+        self._wipe_wrapped(width)
         done = self._row.iteration if self._row else self._done
-        bar = Table.grid()  # a bare bar would not end its line
-        bar.add_row(ProgressBar(total=self._iterations, completed=done, width=60))
-        parts: list[Text | Table] = [Text(self._title, style="bold"), bar, grid]
-        if self._row is None:
-            parts.append(Text("compiling ...", style="dim"))
-        else:
-            unicode = "utf" in (self._console.encoding or "").lower()
-            parts.append(Text(sparkline(self._rewards, 60, unicode=unicode), style="green"))
-        return Group(*parts)
+        view = View(self._title, self._iterations, done, self._cells(), tuple(self._rewards), self._recent)
+        unicode = "utf" in (self._console.encoding or "").lower()
+        # A ^C that the terminal echoes behind the last line must not begin a new one.
+        lines = draw(view, max(width - len("^C"), 1), height - 1, unicode=unicode)
+        self._drawn = width, [len(line) for line in lines]
+        return Group(*lines)
+
+    def _wipe_wrapped(self, width: int) -> None:
+        """Go up over what a terminal that became narrower has wrapped, which `Live` does not know of."""
+        width_before, lengths = self._drawn
+        if width < width_before:
+            wrapped = sum((length - 1) // width for length in lengths if length)
+            wipe = ((ControlType.ERASE_IN_LINE, 2), (ControlType.CURSOR_UP, 1))
+            self._console.control(Control(*wipe * wrapped))
 
 
 def clock(seconds: float) -> str:
@@ -148,28 +159,3 @@ def clock(seconds: float) -> str:
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
     return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
-
-
-def sparkline(rewards: Sequence[float], width: int, *, unicode: bool = True) -> str:
-    """Draw a learning curve in one line of text: the higher the better, on a logarithmic scale.
-
-    Args:
-        rewards: rewards in order; what is not finite leaves a gap.
-        width: most characters to use; neighbours are averaged.
-        unicode: whether the reader can show block characters.
-    """
-    blocks = _BLOCKS if unicode else _ASCII_BLOCKS
-    finite = [reward for reward in rewards if math.isfinite(reward)]
-    if not finite:
-        return ""
-    best = max(finite)
-    smallest = max(1e-3 * (best - min(finite)), 1e-12)
-    means = []
-    for index in range(min(width, len(rewards))):
-        count = min(width, len(rewards))
-        chunk = rewards[index * len(rewards) // count : (index + 1) * len(rewards) // count]
-        kept = [reward for reward in chunk if math.isfinite(reward)]
-        means.append(-math.log(best - sum(kept) / len(kept) + smallest) if kept else math.nan)
-    low, high = (pick(mean for mean in means if math.isfinite(mean)) for pick in (min, max))
-    scale = (len(blocks) - 1) / (high - low) if high > low else 0.0
-    return "".join(blocks[round((mean - low) * scale)] if math.isfinite(mean) else " " for mean in means)
