@@ -199,8 +199,7 @@ def creps(
         return jax.vmap(gaussian.mean, (None, 0))(policy, features)
 
     def checked_contexts(contexts: ArrayLike) -> Array:
-        values = checks.array("contexts", contexts, ("n", context_dim)).astype(jnp.float32)
-        return checks.finite("contexts", values)
+        return checks.finite("contexts", _float32(checks.array("contexts", contexts, ("n", context_dim))))
 
     # Compiled here, as ask and tell are called by hand where a robot is real; checked before, where values
     # can be seen.
@@ -246,6 +245,12 @@ def _features_of(name: str, features: FeatureMap, contexts: Array) -> Array:
     return jax.vmap(apply)(contexts)
 
 
+def _float32(values: Array) -> Array:
+    """Convert to float32; what has that type is returned as it is, as even an idle conversion takes time."""
+    is_float32 = values.dtype == jnp.float32 and not values.weak_type
+    return values if is_float32 else values.astype(jnp.float32)
+
+
 def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> LinearGaussian:
     """Return a policy in float32 after checking that it fits the features, and what is not traced of it."""
     checks.instance(name, policy, LinearGaussian)
@@ -263,7 +268,7 @@ def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> 
             f"the {name} must have coef ({features.size}, d), a row for each of the policy features, "
             f"and cov_chol (d, d), got {coef.shape} and {cov_chol.shape}"
         )
-    policy = LinearGaussian(coef.astype(jnp.float32), cov_chol.astype(jnp.float32))
+    policy = LinearGaussian(_float32(coef), _float32(cov_chol))
     for field, values in policy._asdict().items():
         checks.finite(f"{name}.{field}", values)
     if not isinstance(cov_chol, Tracer):
@@ -292,7 +297,7 @@ def _checked_batch(batch: Batch, archive: Archive) -> Batch:
     num, context_dim = reward.shape[0], archive.batch.context.shape[1]
     context = checks.array("batch.context", batch.context, (num, context_dim))
     theta = checks.array("batch.theta", batch.theta, (num, archive.batch.theta.shape[1]))
-    return Batch(*(values.astype(jnp.float32) for values in (context, theta, reward)))
+    return Batch(*map(_float32, (context, theta, reward)))
 
 
 def _check_fitted(fitted: LinearGaussian, policy: LinearGaussian) -> None:
