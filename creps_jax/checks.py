@@ -68,7 +68,10 @@ def arguments(function: F) -> F:
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
-        bound, arrays = signature.bind(*args, **kwargs), {}
+        try:
+            bound, arrays = signature.bind(*args, **kwargs), {}
+        except TypeError as error:
+            raise TypeError(f"{function.__name__}() {error}") from None  # as Python has it
         for name, value in bound.arguments.items():
             bound.arguments[name] = _checked_argument(name, value, annotations.get(name), arrays)
         return function(*bound.args, **bound.kwargs)

@@ -63,6 +63,13 @@ def test_arguments_are_held_to_their_annotations(change, message):
         annotated(**{**good, **change})
 
 
+def test_arguments_that_are_too_many_or_missing_are_named_as_python_does():
+    with pytest.raises(TypeError, match=r"^annotated\(\) missing a required argument: 'row'"):
+        annotated(np.ones((2, 2)))
+    with pytest.raises(TypeError, match=r"^annotated\(\) got an unexpected keyword argument 'rows'"):
+        annotated(np.ones((2, 2)), None, 1.0, 1, int, rows=None)
+
+
 @pytest.mark.parametrize(
     ("value", "expected"),
     [
