@@ -35,7 +35,7 @@ _SMOOTHED = 5
 
 Settings = walk.Settings
 SETTINGS = {
-    "quick": dataclasses.replace(walk.SETTINGS["quick"], trials=5),
+    "quick": dataclasses.replace(walk.SETTINGS["quick"], iterations=70, trials=5),
     "paper": walk.SETTINGS["paper"],
     "best": dataclasses.replace(walk.SETTINGS["best"], trials=5),
 }

@@ -152,7 +152,8 @@ _OURS = Settings(
 SETTINGS = {
     "quick": dataclasses.replace(
         _OURS,
-        iterations=70,
+        iterations=45,
+        trials=3,
         samples=45,
         first_samples=45,
         repeats=2,

@@ -63,6 +63,7 @@ _OURS = {
     "low": 0.1,
     "high": 0.4,
     "start_std": 0.2,
+    "trials": 1,
     "samples": 60,
     "first_samples": 60,
     "archive_size": 480,

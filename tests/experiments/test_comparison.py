@@ -44,12 +44,8 @@ def test_a_difference_is_believed_when_all_trials_show_it():
     assert comparison.p_value(arrays, "good", "same") == 1.0
 
 
-def test_the_sinus_figure_learns_draws_and_judges():
-    check_figure("fig05_sinus")
-
-
 @pytest.mark.usefixtures("simple_updates")
-@pytest.mark.parametrize("name", ["fig06_reaching", "fig08_hole"])
+@pytest.mark.parametrize("name", ["fig05_sinus", "fig06_reaching", "fig08_hole"])
 def test_a_figure_searches_draws_and_judges(name):
     check_figure(name)
 
