@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.typing import Array, Bool, Float, Int, IntScalar
 
 __all__ = ["Archive", "Batch", "empty_archive", "push", "valid"]
@@ -34,14 +35,13 @@ class Archive(NamedTuple):
     age: Int[Array, " L"]
 
 
+@checks.arguments
 def empty_archive(archive_size: int, context_dim: int, theta_dim: int) -> Archive:
     """Make an archive of `archive_size` empty slots.
 
     Raises:
-        ValueError: If `archive_size` is less than 1.
+        ValueError: If `archive_size` is no whole number of at least 1.
     """
-    if archive_size < 1:
-        raise ValueError(f"archive_size must be at least 1, got {archive_size}")
     batch = Batch(
         context=jnp.zeros((archive_size, context_dim), jnp.float32),
         theta=jnp.zeros((archive_size, theta_dim), jnp.float32),

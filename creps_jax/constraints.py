@@ -1,8 +1,13 @@
 """Keep parameters inside a box: by squashing them into it, or by a price for leaving it."""
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float, ScalarLike, VectorLike
 
 __all__ = ["penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
@@ -20,11 +25,11 @@ def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike)
         Parameters in [low, high]; zero goes to the middle of the box.
 
     Raises:
-        ValueError: If there is neither one bound nor one for each parameter.
+        ValueError: If bounds do not fit the parameters or each other, or a number is none.
 
     Source: Abdolmaleki et al. 2016, Eq. 17.
     """
-    low, high = _box(theta, low, high)
+    theta, low, high = _box(theta, low, high)
     # The clip takes back the last bit that rounding can put outside the box.
     return jnp.clip(low + jax.nn.sigmoid(theta) * (high - low), low, high)
 
@@ -44,9 +49,9 @@ def sigmoid_gate_inverse(
         value that float32 tells from the bound (about 16); a fixed parameter gets zero.
 
     Raises:
-        ValueError: If there is neither one bound nor one for each parameter.
+        ValueError: If bounds do not fit the parameters or each other, or a number is none.
     """
-    low, high = _box(theta, low, high)
+    theta, low, high = _box(theta, low, high)
     is_free = high > low
     fraction = jnp.where(is_free, (theta - low) / jnp.where(is_free, high - low, 1.0), 0.5)
     margin = float(jnp.finfo(theta.dtype).epsneg)
@@ -57,9 +62,9 @@ def violation(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) ->
     """Measure how far each parameter lies outside its bounds: zero inside, positive outside.
 
     Raises:
-        ValueError: If there is neither one bound nor one for each parameter.
+        ValueError: If bounds do not fit the parameters or each other, or a number is none.
     """
-    low, high = _box(theta, low, high)
+    theta, low, high = _box(theta, low, high, largest=math.inf)
     return jnp.maximum(jnp.maximum(low - theta, theta - high), 0.0)
 
 
@@ -72,10 +77,21 @@ def penalty(violation: Float[Array, "*b c"], size: ScalarLike) -> Float[Array, "
     return jnp.where(is_violated, jnp.asarray(size, violation.dtype), jnp.zeros((), violation.dtype))
 
 
-def _box(theta: Array, low: VectorLike, high: VectorLike) -> tuple[Array, Array]:
-    low, high = jnp.asarray(low, theta.dtype), jnp.asarray(high, theta.dtype)
-    if not {low.shape, high.shape} <= {(), theta.shape[-1:]}:
+def _box(
+    theta: Array, low: VectorLike, high: VectorLike, *, largest: float = checks.FLOAT32_MAX
+) -> tuple[Array, Array, Array]:
+    """Return parameters and bounds as arrays of one shape and type, after checking them."""
+    theta = checks.array("theta", theta)
+    low, high = (checks.array(name, end).astype(theta.dtype) for name, end in (("low", low), ("high", high)))
+    if theta.ndim < 1 or not {low.shape, high.shape} <= {(), theta.shape[-1:]}:
         raise ValueError(
-            f"bounds must be numbers or vectors of {theta.shape[-1]}, got shapes {low.shape} and {high.shape}"
+            "theta must be vectors, and the bounds low and high numbers or vectors of their length, "
+            f"got shapes {theta.shape}, {low.shape} and {high.shape}"
         )
-    return jnp.broadcast_to(low, theta.shape), jnp.broadcast_to(high, theta.shape)
+    checks.finite("theta", theta, largest=math.inf)
+    for name, end in (("low", low), ("high", high)):
+        checks.finite(name, end, largest=largest)
+    is_known = not (isinstance(low, Tracer) or isinstance(high, Tracer))
+    if is_known and np.any(np.asarray(low) > np.asarray(high)):
+        raise ValueError(f"low must not exceed high, got {low} and {high}")
+    return theta, jnp.broadcast_to(low, theta.shape), jnp.broadcast_to(high, theta.shape)

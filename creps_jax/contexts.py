@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float, PRNGKey, VectorLike
 
 __all__ = ["context_grid", "gaussian_contexts", "uniform_contexts"]
@@ -14,6 +15,7 @@ Sampler = Callable[[PRNGKey], Array]
 """(key) -> context (s,)."""
 
 
+@checks.arguments
 def gaussian_contexts(
     low: VectorLike, high: VectorLike, *, std: VectorLike | None = None, clip: bool = False
 ) -> Sampler:
@@ -35,11 +37,12 @@ def gaussian_contexts(
     Source: Abdolmaleki et al. 2016, Section 4; the paper gives no mean and no spread.
     """
     low, high = _checked_range(low, high)
-    scale = (high - low) / 4 if std is None else np.atleast_1d(np.asarray(std, np.float32))
+    scale = (high - low) / 4 if std is None else np.atleast_1d(checks.vector("std", std).astype(np.float32))
     if scale.shape not in [(1,), low.shape] or not np.all(scale > 0):
         raise ValueError(f"std must be positive, a number or of shape {low.shape}, got {std}")
     middle, scale = (low + high) / 2, np.broadcast_to(scale, low.shape)
 
+    @checks.arguments
     def sample_context(key: PRNGKey) -> Float[Array, " s"]:
         context = jnp.asarray(middle) + scale * jax.random.normal(key, low.shape)
         return jnp.clip(context, low, high) if clip else context
@@ -62,12 +65,14 @@ def uniform_contexts(low: VectorLike, high: VectorLike) -> Sampler:
     """
     low, high = _checked_range(low, high)
 
+    @checks.arguments
     def sample_context(key: PRNGKey) -> Float[Array, " s"]:
         return jax.random.uniform(key, low.shape, minval=low, maxval=high)
 
     return sample_context
 
 
+@checks.arguments
 def context_grid(low: VectorLike, high: VectorLike, num: int) -> Float[Array, "n s"]:
     """Lay out contexts evenly over a range, both ends included, to evaluate a policy on.
 
@@ -80,19 +85,14 @@ def context_grid(low: VectorLike, high: VectorLike, num: int) -> Float[Array, "n
         All `num ** s` combinations, the last dimension varying fastest.
 
     Raises:
-        ValueError: If the ends do not fit each other, or `num` is less than 2.
+        ValueError: If the ends do not fit each other, or `num` is less than 2 or far too many.
     """
     low, high = _checked_range(low, high)
-    if num < 2:
-        raise ValueError(f"num must be at least 2, got {num}")
+    num = checks.grid("num", num, low.size, least=2)
     axes = [np.linspace(start, stop, num, dtype=np.float32) for start, stop in zip(low, high, strict=True)]
     return jnp.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes)))
 
 
 def _checked_range(low: VectorLike, high: VectorLike) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.atleast_1d(np.asarray(low, np.float32)), np.atleast_1d(np.asarray(high, np.float32))
-    if low.ndim != 1 or low.shape != high.shape:
-        raise ValueError(f"low and high must be vectors of one length, got {low.shape} and {high.shape}")
-    if not (np.all(low < high) and np.all(np.isfinite([low, high]))):
-        raise ValueError(f"low must be below high, both finite, got {low} and {high}")
-    return low, high
+    low, high = checks.ends(low, high)
+    return low.astype(np.float32), high.astype(np.float32)

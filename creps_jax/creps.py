@@ -5,8 +5,6 @@ robot, calls `ask`, measures, and calls `tell`; `creps_jax.train` does so for a 
 """
 
 import dataclasses
-import math
-import numbers
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,6 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
+from creps_jax import checks
 from creps_jax import policy as gaussian
 from creps_jax.archive import Archive, Batch, empty_archive, push, valid
 from creps_jax.dual import DualSolution, sample_kl, sample_weights, solve_dual
@@ -85,7 +84,18 @@ class Creps:
     tell: Callable[[CrepsState, Batch], tuple[CrepsState, CrepsInfo]]
     mean: Callable[[LinearGaussian, ArrayLike], Array]
 
+    def __post_init__(self) -> None:
+        """Check the functions."""
+        for name, arguments in (
+            ("init", "(policy)"),
+            ("ask", "(key, state, contexts)"),
+            ("tell", "(state, batch)"),
+            ("mean", "(policy, contexts)"),
+        ):
+            checks.function(name, getattr(self, name), arguments)
 
+
+@checks.arguments
 def creps(
     policy_features: FeatureMap,
     baseline_features: FeatureMap,
@@ -112,17 +122,16 @@ def creps(
 
     Returns:
         The functions `init`, `ask`, `tell` and `mean`. These raise ValueError, showing what they
-        got and what they expected, if shapes do not fit the features or the policy, or if contexts to ask
-        for are not finite.
+        got and what they expected, if shapes do not fit the features or the policy, if contexts to ask
+        for or a policy are not finite, or if `cov_chol` is no Cholesky factor.
 
     Raises:
         ValueError: If a setting is out of its range, or the features are of different contexts.
 
     Source: Abdolmaleki et al. 2016, Section 3.1.
     """
-    _check_settings(policy_features, baseline_features, kl_bound, archive_size, ridge)
-    if importance is not None and not isinstance(importance, Importance):
-        raise ValueError(f"importance must be an Importance or None, got {importance!r}")
+    _check_settings(policy_features, baseline_features, kl_bound, ridge)
+    checks.function("m_step", m_step, "(policy, samples, *, ridge, scale) -> policy")
     if m_step is bounded_ml:
         raise ValueError(
             "m_step must be an M-step, such as bounded_ml(), got bounded_ml without its parentheses"
@@ -131,39 +140,41 @@ def creps(
     scale = None if policy_features.scale is None else jnp.asarray(policy_features.scale, jnp.float32)
 
     def init(policy: LinearGaussian) -> CrepsState:
-        theta_dim = _checked_theta_dim(policy, policy_features)
+        policy = _checked_policy("policy", policy, policy_features)
+        for field, values in policy._asdict().items():
+            checks.finite(f"policy.{field}", values, largest=checks.LARGEST)
+        theta_dim = policy.coef.shape[1]
         least = policy_features.size + theta_dim
         if archive_size < least:
             raise ValueError(
                 f"archive_size must be at least {least}, features and parameters, got {archive_size}"
             )
         archive = empty_archive(archive_size, context_dim, theta_dim)
-        policy = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), policy)
         history = None if importance is None else empty_history(policy, importance.num_policies)
         return CrepsState(policy, archive, jnp.zeros((), jnp.int32), history)
 
-    def ask(key: PRNGKey, state: CrepsState, contexts: ArrayLike) -> Float[Array, "n d"]:
-        contexts = _checked("contexts", contexts, ("n", context_dim))
+    def ask(key: PRNGKey, state: CrepsState, contexts: Array) -> Float[Array, "n d"]:
         keys = jax.random.split(key, contexts.shape[0])
-        features = jax.vmap(policy_features.apply)(contexts)
+        features = _features_of("policy_features", policy_features, contexts)
         return jax.vmap(gaussian.sample, (0, None, 0))(keys, state.policy, features)
 
     def tell(state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
-        archive = push(state.archive, _checked_batch(batch, state.archive))
+        archive = push(state.archive, batch)
         is_valid = valid(archive)
         # What is left out must not enter: 0 * nan is not 0.
         samples = jax.tree.map(lambda x: jnp.where(_along(is_valid, x), x, 0.0), archive.batch)
 
-        features = jax.vmap(policy_features.apply)(samples.context)
+        features = _features_of("policy_features", policy_features, samples.context)
         if importance is not None:
             is_valid = is_valid & (archive.age < importance.num_policies)
         prior, history = _prior(state, importance, features, samples.theta, archive.age, is_valid)
 
-        baseline = jax.vmap(baseline_features.apply)(samples.context)
+        baseline = _features_of("baseline_features", baseline_features, samples.context)
         dual = solve_dual(samples.reward, baseline, prior, kl_bound=kl_bound)  # Eq. (13)
         weights = sample_weights(dual, samples.reward, baseline, prior)
         weighted = WeightedSamples(features, samples.theta, weights, is_valid)
         fitted = m_step(state.policy, weighted, ridge=ridge, scale=scale)  # Eq. (14), (15)
+        _check_fitted(fitted, state.policy)
 
         num_valid = jnp.sum(is_valid, dtype=jnp.int32)
         is_finite = jnp.all(jnp.isfinite(fitted.coef)) & jnp.all(jnp.isfinite(fitted.cov_chol))
@@ -183,18 +194,27 @@ def creps(
         )
         return CrepsState(policy, archive, state.iteration + 1, history), info
 
-    def mean(policy: LinearGaussian, contexts: ArrayLike) -> Float[Array, "n d"]:
-        contexts = _checked("contexts", contexts, ("n", context_dim))
-        features = jax.vmap(policy_features.apply)(contexts)
+    def mean(policy: LinearGaussian, contexts: Array) -> Float[Array, "n d"]:
+        features = _features_of("policy_features", policy_features, contexts)
         return jax.vmap(gaussian.mean, (None, 0))(policy, features)
 
-    # Compiled here, as ask and tell are called by hand where a robot is real.
-    compiled_ask, compiled_mean = jax.jit(ask), jax.jit(mean)
+    def checked_contexts(contexts: ArrayLike) -> Array:
+        return checks.finite("contexts", _float32(checks.array("contexts", contexts, ("n", context_dim))))
+
+    # Compiled here, as ask and tell are called by hand where a robot is real; checked before, where values
+    # can be seen.
+    compiled_ask, compiled_tell, compiled_mean = jax.jit(ask), jax.jit(tell), jax.jit(mean)
     return Creps(
         init=init,
-        ask=lambda key, state, contexts: compiled_ask(key, state, _checked_finite(contexts)),
-        tell=jax.jit(tell),
-        mean=lambda policy, contexts: compiled_mean(policy, _checked_finite(contexts)),
+        ask=lambda key, state, contexts: compiled_ask(
+            checks.key("key", key), _checked_state(state, policy_features), checked_contexts(contexts)
+        ),
+        tell=lambda state, batch: compiled_tell(
+            _checked_state(state, policy_features), _checked_batch(batch, state.archive)
+        ),
+        mean=lambda policy, contexts: compiled_mean(
+            _checked_policy("policy", policy, policy_features), checked_contexts(contexts)
+        ),
     )
 
 
@@ -218,34 +238,72 @@ def _along(mask: Array, array: Array) -> Array:
     return mask.reshape(mask.shape + (1,) * (array.ndim - 1))
 
 
-def _checked(name: str, value: ArrayLike, shape: tuple[int | str, ...]) -> Array:
-    """Return an array of float32 after comparing its shape; a letter stands for any number above zero."""
-    array = jnp.asarray(value, jnp.float32)
-    fits = len(array.shape) == len(shape) and all(
-        got == expected or (isinstance(expected, str) and got > 0)
-        for got, expected in zip(array.shape, shape, strict=True)
+def _features_of(name: str, features: FeatureMap, contexts: Array) -> Array:
+    def apply(context: Array) -> Array:
+        return checks.array(f"{name}.apply(context)", features.apply(context), (features.size,))
+
+    return jax.vmap(apply)(contexts)
+
+
+def _float32(values: Array) -> Array:
+    """Convert to float32; what has that type is returned as it is, as even an idle conversion takes time."""
+    is_float32 = values.dtype == jnp.float32 and not values.weak_type
+    return values if is_float32 else values.astype(jnp.float32)
+
+
+def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> LinearGaussian:
+    """Return a policy in float32 after checking that it fits the features, and what is not traced of it."""
+    checks.instance(name, policy, LinearGaussian)
+    coef, cov_chol = (
+        checks.array(f"{name}.coef", policy.coef),
+        checks.array(f"{name}.cov_chol", policy.cov_chol),
     )
-    if not fits:
-        expected = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
-        raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
-    return array
+    if (
+        coef.ndim != 2
+        or coef.shape[0] != features.size
+        or 0 in coef.shape
+        or cov_chol.shape != (coef.shape[1],) * 2
+    ):
+        raise ValueError(
+            f"the {name} must have coef ({features.size}, d), a row for each of the policy features, "
+            f"and cov_chol (d, d), got {coef.shape} and {cov_chol.shape}"
+        )
+    policy = LinearGaussian(_float32(coef), _float32(cov_chol))
+    for field, values in policy._asdict().items():
+        checks.finite(f"{name}.{field}", values)
+    if not isinstance(cov_chol, Tracer):
+        upper, diagonal = np.triu(policy.cov_chol, 1), np.diagonal(policy.cov_chol)
+        if upper.any():
+            entry = upper[upper != 0][0]
+            raise ValueError(f"{name}.cov_chol must be lower triangular, got {entry} above its diagonal")
+        checks.finite(f"the diagonal of {name}.cov_chol", diagonal, above=0.0)
+    return policy
 
 
-def _checked_finite(contexts: ArrayLike) -> ArrayLike:
-    """Refuse contexts that are not finite; within a trace nobody can tell."""
-    if not isinstance(contexts, Tracer):
-        values = np.asarray(contexts, float)
-        if not np.isfinite(values).all():
-            raise ValueError(f"contexts must be finite, got {values[~np.isfinite(values)][0]}")
-    return contexts
+def _checked_state(state: CrepsState, features: FeatureMap) -> CrepsState:
+    """Return a state, its policy in float32, after checking that it is one of these features."""
+    checks.instance("state", state, CrepsState)
+    policy = _checked_policy("state.policy", state.policy, features)
+    checks.instance("state.archive", state.archive, Archive)
+    context, theta, _ = state.archive.batch
+    checks.array("state.archive.batch.context", context, ("L", features.context_dim))
+    checks.array("state.archive.batch.theta", theta, ("L", policy.coef.shape[1]))
+    return state._replace(policy=policy)
 
 
 def _checked_batch(batch: Batch, archive: Archive) -> Batch:
-    reward = _checked("batch.reward", batch.reward, ("n",))
+    checks.instance("batch", batch, Batch)
+    reward = checks.array("batch.reward", batch.reward, ("n",))
     num, context_dim = reward.shape[0], archive.batch.context.shape[1]
-    context = _checked("batch.context", batch.context, (num, context_dim))
-    theta = _checked("batch.theta", batch.theta, (num, archive.batch.theta.shape[1]))
-    return Batch(context, theta, reward)
+    context = checks.array("batch.context", batch.context, (num, context_dim))
+    theta = checks.array("batch.theta", batch.theta, (num, archive.batch.theta.shape[1]))
+    return Batch(*map(_float32, (context, theta, reward)))
+
+
+def _check_fitted(fitted: LinearGaussian, policy: LinearGaussian) -> None:
+    checks.instance("what m_step returns", fitted, LinearGaussian)
+    for field, values in policy._asdict().items():
+        checks.array(f"{field} of what m_step returns", getattr(fitted, field), values.shape)
 
 
 def _prior(
@@ -271,31 +329,28 @@ def _prior(
     return weights, history
 
 
-def _checked_theta_dim(policy: LinearGaussian, policy_features: FeatureMap) -> int:
-    coef_shape, cov_shape = jnp.shape(policy.coef), jnp.shape(policy.cov_chol)
-    if len(coef_shape) != 2 or coef_shape[0] != policy_features.size or cov_shape != (coef_shape[1],) * 2:
-        raise ValueError(
-            f"the policy must have coef ({policy_features.size}, d), a row for each of the policy features, "
-            f"and cov_chol (d, d), got {coef_shape} and {cov_shape}"
-        )
-    return coef_shape[1]
-
-
 def _check_settings(
     policy_features: FeatureMap,
     baseline_features: FeatureMap,
     kl_bound: float | int,
-    archive_size: int,
     ridge: float | int,
 ) -> None:
+    _check_features("policy_features", policy_features)
+    _check_features("baseline_features", baseline_features)
     if policy_features.context_dim != baseline_features.context_dim:
         raise ValueError(
-            "policy and baseline features must be of the same context, got "
+            "policy_features and baseline_features must be of the same context, got "
             f"{policy_features.context_dim} and {baseline_features.context_dim} variables"
         )
-    if not (kl_bound > 0 and math.isfinite(kl_bound)):
-        raise ValueError(f"kl_bound must be positive and finite, got {kl_bound}")
-    if not isinstance(archive_size, numbers.Integral) or archive_size < 1:
-        raise ValueError(f"archive_size must be an integer of at least 1, got {archive_size!r}")
-    if not (ridge >= 0 and math.isfinite(ridge)):
-        raise ValueError(f"ridge must be finite and not negative, got {ridge}")
+    checks.number("kl_bound", kl_bound, above=0.0)
+    checks.number("ridge", ridge, least=0.0)
+
+
+def _check_features(name: str, features: FeatureMap) -> None:
+    checks.function(f"{name}.apply", features.apply, "(context) -> features")
+    size = checks.count(f"{name}.size", features.size)
+    checks.count(f"{name}.context_dim", features.context_dim)
+    if features.scale is not None:
+        scale = checks.vector(f"{name}.scale", features.scale)
+        if scale.shape != (size,) or not np.all(scale > 0):
+            raise ValueError(f"{name}.scale must be {size} numbers above 0, got {features.scale}")

@@ -1,14 +1,13 @@
 """Weigh samples by contextual relative entropy policy search: the dual function, its minimum, the weights."""
 
-import math
 from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.core import Tracer
 from jax.scipy.special import logsumexp
 
+from creps_jax import checks
 from creps_jax.linalg import centre_columns, exact_dot, whitening
 from creps_jax.minimise import minimise
 from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
@@ -69,7 +68,7 @@ def dual_objective(
 
     Source: Abdolmaleki et al. 2016, Eq. 13.
     """
-    prior = _check_samples(reward, features, valid)
+    reward, features, prior = _checked_samples(reward, features, valid)
     return _dual(log_temperature, baseline_coef, *_mask(reward, features, prior), kl_bound)
 
 
@@ -117,10 +116,8 @@ def solve_dual(
 
     Source: Abdolmaleki et al. 2016, Eq. 12 and 13.
     """
-    prior = _check_samples(reward, features, valid)
-    if not isinstance(kl_bound, Tracer) and not 0.0 < float(kl_bound) < math.inf:
-        raise ValueError(f"kl_bound has to be a positive number, got {kl_bound}")
-    kl_bound = jnp.asarray(kl_bound, reward.dtype)
+    reward, features, prior = _checked_samples(reward, features, valid)
+    kl_bound = jnp.asarray(checks.number("kl_bound", kl_bound, above=0.0), reward.dtype)
     samples, unit = _standardise(reward, features, prior)
 
     guess = _search(samples, kl_bound)
@@ -162,7 +159,8 @@ def sample_weights(
 
     Source: Abdolmaleki et al. 2016, the solution p(s, theta) below Eq. 12.
     """
-    prior = _check_samples(reward, features, valid)
+    reward, features, prior = _checked_samples(reward, features, valid)
+    solution = _checked_solution(solution, features)
     is_counted = _is_counted(reward, features, prior)
     reward, features, prior = _mask(reward, features, prior)
     shifted, centred = _shift(reward, prior), centre_columns(features, prior)
@@ -373,11 +371,20 @@ def _is_counted(reward: Array, features: Array, prior: Array) -> Array:
     return (prior > 0) & jnp.isfinite(prior) & jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
 
 
-def _check_samples(reward: Array, features: Array, valid: Array | None) -> Array:
-    """Return how much each sample counts, by default equally, after checking shapes."""
+def _checked_samples(reward: Array, features: Array, valid: Array | None) -> tuple[Array, Array, Array]:
+    """Return rewards, features and how much each sample counts, by default equally, after checking shapes."""
+    reward, features = checks.array("reward", reward), checks.array("features", features)
     if reward.ndim != 1 or features.ndim != 2 or features.shape[0] != reward.shape[0] or 0 in features.shape:
-        raise ValueError(f"need reward (n,) and features (n, m), got shapes {reward.shape}, {features.shape}")
-    prior = jnp.ones(reward.shape, reward.dtype) if valid is None else valid.astype(reward.dtype)
-    if prior.shape != reward.shape:
-        raise ValueError(f"valid has to have the shape of reward, {reward.shape}, got {prior.shape}")
-    return prior
+        raise ValueError(
+            f"reward must have shape (n,) and features (n, m), got shapes {reward.shape} and {features.shape}"
+        )
+    if valid is None:
+        return reward, features, jnp.ones(reward.shape, reward.dtype)
+    return reward, features, checks.array("valid", valid, reward.shape).astype(reward.dtype)
+
+
+def _checked_solution(solution: DualSolution, features: Array) -> DualSolution:
+    checks.instance("solution", solution, DualSolution)
+    checks.number("solution.temperature", solution.temperature, above=0.0)
+    coef = checks.array("solution.baseline_coef", solution.baseline_coef, features.shape[1:])
+    return solution._replace(baseline_coef=checks.finite("solution.baseline_coef", coef))

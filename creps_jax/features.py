@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float, VectorLike
 
 __all__ = ["FeatureMap", "linear_features", "quadratic_features", "rbf_features", "rbf_grid"]
@@ -26,6 +27,7 @@ class FeatureMap(NamedTuple):
     a unit, and its size on the samples has to do."""
 
 
+@checks.arguments
 def linear_features(dim: int) -> FeatureMap:
     """Make the features [1, s] of an affine policy.
 
@@ -40,15 +42,15 @@ def linear_features(dim: int) -> FeatureMap:
 
     Source: Abdolmaleki et al. 2016, text below Eq. 15.
     """
-    _check_dim("linear_features", dim)
 
     def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
-        _check_context(context, dim)
+        context = _checked_context(context, dim)
         return jnp.concatenate([jnp.ones_like(context[:1]), context])
 
     return FeatureMap(apply, 1 + dim, dim)
 
 
+@checks.arguments
 def quadratic_features(dim: int) -> FeatureMap:
     """Make the features [s, s^2] of a quadratic baseline.
 
@@ -66,10 +68,9 @@ def quadratic_features(dim: int) -> FeatureMap:
 
     Source: Abdolmaleki et al. 2016, text below Eq. 11 and 15.
     """
-    _check_dim("quadratic_features", dim)
 
     def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
-        _check_context(context, dim)
+        context = _checked_context(context, dim)
         return jnp.concatenate([context, context**2])
 
     return FeatureMap(apply, 2 * dim, dim)
@@ -104,7 +105,7 @@ def rbf_features(
     dim = lows.size
 
     def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
-        _check_context(context, dim)
+        context = _checked_context(context, dim)
         dtype = context.dtype
         nearest = jnp.clip(context, jnp.asarray(lows, dtype), jnp.asarray(highs, dtype))
         width = jnp.asarray(widths, dtype)
@@ -144,26 +145,15 @@ def _rbf_settings(
     low: VectorLike, high: VectorLike, num_centers: int, bandwidth: VectorLike | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return low, high and width of each context variable as arrays of one length, after checking them."""
-    if isinstance(num_centers, bool) or not isinstance(num_centers, int | np.integer) or num_centers < 1:
-        raise ValueError(f"num_centers has to be a whole number >= 1, got {num_centers!r}")
-    lows, highs = np.atleast_1d(np.asarray(low, float)), np.atleast_1d(np.asarray(high, float))
-    if lows.ndim != 1 or lows.shape != highs.shape:
-        raise ValueError(f"low and high have to be of one length, got shapes {lows.shape} and {highs.shape}")
-    if not (np.all(np.isfinite(lows)) and np.all(np.isfinite(highs)) and np.all(lows < highs)):
-        raise ValueError(f"low has to be below high, both finite, got low={low} and high={high}")
-    widths = (highs - lows) / num_centers if bandwidth is None else np.asarray(bandwidth, float)
-    if widths.ndim > 1 or widths.shape not in ((), (1,), lows.shape):
-        raise ValueError(f"bandwidth has to be a number or as long as low, {lows.size}, got {bandwidth}")
-    if not (np.all(np.isfinite(widths)) and np.all(widths > 0)):
-        raise ValueError(f"bandwidth has to be finite and above zero, got {bandwidth}")
+    lows, highs = checks.ends(low, high)
+    checks.grid("num_centers", num_centers, lows.size)
+    widths = (highs - lows) / num_centers if bandwidth is None else checks.vector("bandwidth", bandwidth)
+    if widths.shape not in ((), (1,), lows.shape):
+        raise ValueError(f"bandwidth must be a number or as long as low, {lows.size}, got {bandwidth}")
+    if not np.all(widths.astype(np.float32) > 0):
+        raise ValueError(f"bandwidth must be above zero, got {bandwidth}")
     return lows, highs, np.broadcast_to(widths, lows.shape)
 
 
-def _check_dim(name: str, dim: int) -> None:
-    if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim < 1:
-        raise ValueError(f"{name} needs a whole number of context variables >= 1, got {dim!r}")
-
-
-def _check_context(context: Array, dim: int) -> None:
-    if context.shape != (dim,):
-        raise ValueError(f"a context has to have shape ({dim},), got {context.shape}")
+def _checked_context(context: Array, dim: int) -> Array:
+    return checks.finite("context", checks.array("context", context, (dim,)))

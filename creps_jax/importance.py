@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import logsumexp
 
+from creps_jax import checks
 from creps_jax.linalg import exact_dot
 from creps_jax.policy import LinearGaussian
 from creps_jax.typing import Array, Bool, Float, Int, IntScalar
@@ -37,10 +38,8 @@ class Importance:
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        if self.num_policies < 1:
-            raise ValueError(f"num_policies must be at least 1, got {self.num_policies}")
-        if not self.least_effective >= 1.0:
-            raise ValueError(f"least_effective must be at least 1, got {self.least_effective}")
+        checks.count("num_policies", self.num_policies)
+        checks.number("least_effective", self.least_effective, least=1.0)
 
 
 class PolicyHistory(NamedTuple):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float, ScalarLike
 
 __all__ = [
@@ -30,6 +31,7 @@ def exact_dot(left: Float[Array, "..."], right: Float[Array, "..."]) -> Float[Ar
     return jnp.dot(left, right, precision=lax.Precision.HIGHEST)
 
 
+@checks.arguments
 def thomas_solve(
     lower: Float[Array, " n"],
     diag: Float[Array, " n"],
@@ -52,16 +54,16 @@ def thomas_solve(
         The solution x.
 
     Raises:
-        ValueError: If the four are not vectors of one length n >= 1.
+        ValueError: If the four are not vectors of one length n >= 1, a number is not finite, or a pivot is
+            zero.
 
     Source: Abdolmaleki et al. 2016, Eq. 7 and 8 (with `a(k)` in the denominator, which the print has wrong).
     """
-    shapes = [jnp.shape(array) for array in (lower, diag, upper, rhs)]
-    if len(set(shapes)) != 1 or len(shapes[0]) != 1 or shapes[0][0] < 1:
-        raise ValueError(f"thomas_solve needs four vectors of one length n >= 1, got shapes {shapes}")
     # What is not used must not enter: zero times a non-finite number is not zero.
     lower = lower.at[0].set(0.0)
     upper = upper.at[-1].set(0.0)
+    for name, entries in (("lower", lower), ("diag", diag), ("upper", upper), ("rhs", rhs)):
+        checks.finite(name, entries)
 
     def eliminate(above: _Pair, row: tuple[Array, Array, Array, Array]) -> tuple[_Pair, _Pair]:
         upper_above, rhs_above = above
@@ -78,7 +80,7 @@ def thomas_solve(
     zero = jnp.zeros_like(rhs[0])
     _, reduced = lax.scan(eliminate, (zero, zero), (lower, diag, upper, rhs))
     _, solution = lax.scan(substitute, zero, reduced, reverse=True)
-    return solution
+    return checks.finite("the solution, for which lower, diag and upper have to leave all pivots,", solution)
 
 
 def weighted_ridge(

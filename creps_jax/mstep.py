@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from creps_jax import checks
 from creps_jax.linalg import exact_dot, unbiased_normaliser
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
 from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
@@ -41,6 +42,7 @@ MStep = Callable[..., LinearGaussian]
 """`(old policy, samples, *, ridge, scale) -> new policy`; see `fit_weighted_ml` for the settings."""
 
 
+@checks.arguments
 def weighted_ml(
     policy: LinearGaussian,
     samples: WeightedSamples,
@@ -53,6 +55,7 @@ def weighted_ml(
     return fit_weighted_ml(features, theta, weights, ridge=ridge, scale=scale, start=policy.coef)
 
 
+@checks.arguments
 def bounded_ml(
     *, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05, entropy_loss_bound: float | None = None
 ) -> MStep:
@@ -92,8 +95,7 @@ def bounded_ml(
     if entropy_loss_bound is not None:
         bounds["entropy_loss_bound"] = entropy_loss_bound
     for name, bound in bounds.items():
-        if not bound > 0:
-            raise ValueError(f"{name} must be positive, got {bound}")
+        checks.number(name, bound, above=0.0)
 
     def m_step(
         policy: LinearGaussian,

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.linalg import exact_dot, safe_cholesky, unbiased_normaliser, weighted_ridge
 from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike
 
@@ -116,6 +117,7 @@ def entropy(policy: LinearGaussian) -> Scalar:
     return _half_log_det(policy) + 0.5 * (1.0 + _LOG_TWO_PI) * policy.cov_chol.shape[0]
 
 
+@checks.arguments
 def fit_weighted_ml(
     features: Float[Array, "n p"],
     theta: Float[Array, "n d"],
@@ -146,18 +148,21 @@ def fit_weighted_ml(
         definite for any weights: what too few samples leave open is filled in as small as rounding allows.
 
     Raises:
-        ValueError: If the numbers of samples differ.
+        ValueError: If shapes do not fit each other, or a number is out of its range.
 
     Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
     """
-    if features.shape[0] != theta.shape[0] or weights.shape != (theta.shape[0],):
-        raise ValueError(
-            "fit_weighted_ml needs features (n, p), theta (n, d) and weights (n,), "
-            f"got shapes {features.shape}, {theta.shape} and {weights.shape}"
-        )
+    checks.finite("weights", weights, least=0.0)
+    checks.number("ridge", ridge, least=0.0)
+    if scale is not None:
+        checks.finite("scale", scale, above=0.0, largest=checks.LARGEST)
+    if start is not None:
+        checks.finite("start", start, largest=checks.LARGEST)
     is_weighted = weights > 0
     features = jnp.where(is_weighted[:, None], features, 0.0)
     theta = jnp.where(is_weighted[:, None], theta, 0.0)
+    checks.finite("features", features, largest=checks.LARGEST)
+    checks.finite("theta", theta, largest=checks.LARGEST)
     total = jnp.sum(weights)
     weights = weights / jnp.where(total > 0, total, 1.0)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from creps_jax.tasks.base import Task
+from creps_jax.tasks.base import Task, check_outcome
 from creps_jax.typing import Array, Bool, Float, PRNGKey
 
 __all__ = ["Devices", "device_tuple", "mean_outcome", "replicate", "roll_out", "share_rows", "spread_rows"]
@@ -23,12 +23,17 @@ def device_tuple(devices: Devices) -> tuple[jax.Device, ...]:
     """Return the devices in a form that can be compiled for; all local ones for None.
 
     Raises:
-        ValueError: If there is no device.
+        ValueError: If there is no device, or something else among them.
     """
-    devices = tuple(jax.local_devices() if devices is None else devices)
-    if not devices:
-        raise ValueError("devices must hold at least one device, got none")
-    return devices
+    if devices is None:
+        return tuple(jax.local_devices())
+    if (
+        not isinstance(devices, Sequence)
+        or not devices
+        or not all(isinstance(x, jax.Device) for x in devices)
+    ):
+        raise ValueError(f"devices must be one device or more, as jax.devices() has them, got {devices!r}")
+    return tuple(devices)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
@@ -53,16 +58,14 @@ def roll_out(
         worst, and which rollouts failed so.
 
     Raises:
-        ValueError: If the task gives anything but one reward a rollout.
+        ValueError: If a rollout of the task gives anything but an outcome with one reward.
     """
     num = contexts.shape[0]
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
-    rollouts = jax.vmap(task.rollout)
+    rollouts = jax.vmap(lambda *arguments: check_outcome(task.rollout(*arguments)))
     if len(devices) > 1:
         rollouts = _shared_out(rollouts, devices)
     outcomes = rollouts(keys, contexts, thetas)
-    if outcomes.reward.shape != (num,):
-        raise ValueError(f"a rollout must give one reward, got shape {outcomes.reward.shape[1:]}")
     is_failed = ~jnp.isfinite(outcomes.reward)
     reward = jnp.where(is_failed, jnp.float32(task.worst_reward), outcomes.reward.astype(jnp.float32))
     return outcomes._replace(reward=reward), is_failed

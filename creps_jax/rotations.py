@@ -15,6 +15,7 @@ Values and gradients are finite at gimbal lock and for a zero quaternion too.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from creps_jax import checks
 from creps_jax.typing import ScalarLike
 
 __all__ = [
@@ -33,36 +34,44 @@ __all__ = [
 _TINY = 1e-12
 
 
+@checks.arguments
 def safe_arctan2(y: Float[Array, "*b"], x: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Return the angle of the point (x, y), and 0 with a zero gradient at the origin."""
+    if y.shape != x.shape:
+        raise ValueError(f"y and x must have the same shape, got {y.shape} and {x.shape}")
     is_origin = x * x + y * y < _TINY
     return jnp.where(is_origin, 0.0, jnp.arctan2(jnp.where(is_origin, 0.0, y), jnp.where(is_origin, 1.0, x)))
 
 
+@checks.arguments
 def rotation_x(angle: ScalarLike) -> Float[Array, "3 3"]:
     """Return the rotation by `angle` (rad) about the x axis."""
     c, s, zero, one = _rotation_entries(angle)
     return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
 
 
+@checks.arguments
 def rotation_y(angle: ScalarLike) -> Float[Array, "3 3"]:
     """Return the rotation by `angle` (rad) about the y axis."""
     c, s, zero, one = _rotation_entries(angle)
     return jnp.stack([c, zero, s, zero, one, zero, -s, zero, c]).reshape(3, 3)
 
 
+@checks.arguments
 def rotation_z(angle: ScalarLike) -> Float[Array, "3 3"]:
     """Return the rotation by `angle` (rad) about the z axis."""
     c, s, zero, one = _rotation_entries(angle)
     return jnp.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3)
 
 
+@checks.arguments
 def rpy_to_matrix(rpy: Float[Array, "3"]) -> Float[Array, "3 3"]:
     """Return ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``."""
     roll, pitch, yaw = rpy
     return rotation_z(yaw) @ rotation_y(pitch) @ rotation_x(roll)
 
 
+@checks.arguments
 def matrix_to_rpy(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """Return (roll, pitch, yaw) with pitch in [-pi/2, pi/2], the inverse of `rpy_to_matrix`.
 
@@ -78,6 +87,7 @@ def matrix_to_rpy(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return jnp.stack([roll, pitch, yaw])
 
 
+@checks.arguments
 def quat_to_matrix(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
     """Return the rotation matrix of a (w, x, y, z) quaternion of any length; the identity for length 0."""
     squared_length = quat @ quat
@@ -92,11 +102,13 @@ def quat_to_matrix(quat: Float[Array, "4"]) -> Float[Array, "3 3"]:
     ]).reshape(3, 3)  # fmt: skip
 
 
+@checks.arguments
 def quat_to_rpy(quat: Float[Array, "4"]) -> Float[Array, "3"]:
     """Return (roll, pitch, yaw) of a (w, x, y, z) quaternion of any length."""
     return matrix_to_rpy(quat_to_matrix(quat))
 
 
+@checks.arguments
 def rpy_to_quat(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
     """Return the unit (w, x, y, z) quaternion of ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``."""
     (cr, cp, cy), (sr, sp, sy) = jnp.cos(rpy / 2.0), jnp.sin(rpy / 2.0)
@@ -108,6 +120,7 @@ def rpy_to_quat(rpy: Float[Array, "3"]) -> Float[Array, "4"]:
     ])  # fmt: skip
 
 
+@checks.arguments
 def rigid_transform(rotation: Float[Array, "3 3"], position: Float[Array, "3"]) -> Float[Array, "4 4"]:
     """Return the (4, 4) transform with this rotation and translation."""
     bottom = jnp.zeros((1, 4), rotation.dtype).at[0, 3].set(1.0)

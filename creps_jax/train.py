@@ -14,7 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Key, UInt32
 
-from creps_jax.archive import Batch
+from creps_jax import checks
+from creps_jax.archive import Archive, Batch
 from creps_jax.creps import Creps, CrepsInfo, CrepsState
 from creps_jax.policy import LinearGaussian
 from creps_jax.rollouts import (
@@ -58,6 +59,7 @@ class IterationLog(NamedTuple):
     """The new samples; None in the logs of several iterations, which may differ in their number."""
 
 
+@checks.arguments
 def make_iteration(
     task: Task, algorithm: Creps, *, samples: int, devices: Devices = None
 ) -> Callable[[PRNGKey, CrepsState], tuple[CrepsState, IterationLog]]:
@@ -77,14 +79,20 @@ def make_iteration(
         the task.
 
     Raises:
-        ValueError: If `samples` is less than 1 or there are no devices.
+        ValueError: If an argument is no task, algorithm, positive whole number or devices.
 
     Source: Abdolmaleki et al. 2016, Algorithm 1.
     """
     setup = _make_setup(task, algorithm, samples, devices)
-    return lambda key, state: _iterate(setup, key, replicate(state, setup.devices))
+
+    @checks.arguments
+    def iteration(key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
+        return _iterate(setup, key, replicate(_checked_state("state", state), setup.devices))
+
+    return iteration
 
 
+@checks.arguments
 def train(
     key: PRNGKey,
     task: Task,
@@ -116,15 +124,18 @@ def train(
         The last state, and the logs stacked along a first axis of `iterations`.
 
     Raises:
-        ValueError: If a number is less than 1, or the state does not fit task or features.
+        ValueError: If an argument is none of what is asked for here, or state, task and features do not fit
+            each other.
     """
-    state = start if isinstance(start, CrepsState) else algorithm.init(start)
+    _check_callback(on_iteration)
+    state = _checked_start(start) if isinstance(start, CrepsState) else algorithm.init(start)
     phases = _phases(task, algorithm, state, iterations, samples, first_samples, devices)
     state = replicate(state, phases[0][0].devices)
     state, logs = _run(_iterate, phases, key, state, on_iteration)
     return state, jax.tree.map(jnp.asarray, logs)
 
 
+@checks.arguments
 def train_trials(
     keys: Key[Array, " trials"] | UInt32[Array, "trials 2"],
     task: Task,
@@ -159,14 +170,17 @@ def train_trials(
     Raises:
         ValueError: As in `train`, and if there is not one state for each key.
     """
-    num_trials = keys.shape[0]
+    num_trials = len(checks.key("keys", keys, num_axes=1))
+    _check_callback(on_iteration)
     if isinstance(start, CrepsState):
-        states = start
+        states = _checked_start(start)
     else:
         first = algorithm.init(start)
         states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_trials, *x.shape)), first)
-    if states.iteration.shape != (num_trials,):
-        raise ValueError(f"one state is needed for each of {num_trials} keys, got {states.iteration.shape}")
+    if jnp.shape(states.iteration) != (num_trials,):
+        raise ValueError(
+            f"start must have one state for each of {num_trials} keys, got {jnp.shape(states.iteration)}"
+        )
     phases = _phases(task, algorithm, states, iterations, samples, first_samples, devices)
     setup = phases[0][0]
     if _shares_trials(setup, num_trials):
@@ -177,6 +191,7 @@ def train_trials(
     return states, jax.tree.map(lambda x: jnp.asarray(np.swapaxes(x, 0, 1)), logs)
 
 
+@checks.arguments
 def evaluate(
     key: PRNGKey,
     task: Task,
@@ -203,10 +218,8 @@ def evaluate(
     Raises:
         ValueError: If a shape does not fit the task, or `repeats` is less than 1.
     """
-    if repeats < 1:
-        raise ValueError(f"repeats must be at least 1, got {repeats}")
-    num = contexts.shape[0]
-    if contexts.shape != (num, task.context_dim) or thetas.shape != (num, task.theta_dim) or num == 0:
+    num = len(contexts)
+    if contexts.shape[1] != task.context_dim or thetas.shape[1] != task.theta_dim:
         raise ValueError(
             f"the task takes contexts (n, {task.context_dim}) and thetas (n, {task.theta_dim}), "
             f"got {contexts.shape} and {thetas.shape}"
@@ -226,8 +239,6 @@ class _Setup(NamedTuple):
 
 
 def _make_setup(task: Task, algorithm: Creps, samples: int, devices: Devices) -> _Setup:
-    if samples < 1:
-        raise ValueError(f"samples must be at least 1, got {samples}")
     return _Setup(task, algorithm, samples, device_tuple(devices))
 
 
@@ -239,9 +250,7 @@ def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState
     # differently in a scan and on its own.
     key, state = lax.optimization_barrier((key, state))
     context_key, theta_key, rollout_key = jax.random.split(jax.random.fold_in(key, state.iteration), 3)
-    contexts = jax.vmap(task.sample_context)(jax.random.split(context_key, samples))
-    if contexts.shape != (samples, task.context_dim):
-        raise ValueError(f"sample_context must give ({task.context_dim},), got {contexts.shape[1:]}")
+    contexts = jax.vmap(partial(_sample_context, task))(jax.random.split(context_key, samples))
     thetas = algorithm.ask(theta_key, state, contexts)
     outcomes, is_failed = roll_out(task, devices, rollout_key, contexts, thetas)
     state, info = algorithm.tell(state, Batch(contexts, thetas, outcomes.reward))
@@ -261,6 +270,10 @@ def _iterate_trials(setup: _Setup, keys: Array, states: CrepsState) -> tuple[Cre
         return jax.vmap(partial(_iterate, setup))(keys, states)
     alone = setup._replace(devices=setup.devices[:1])
     return share_rows(jax.vmap(partial(_iterate, alone)), setup.devices)(keys, states)
+
+
+def _sample_context(task: Task, key: PRNGKey) -> Array:
+    return checks.array("what sample_context gives", task.sample_context(key), (task.context_dim,))
 
 
 def _shares_trials(setup: _Setup, num_trials: int) -> bool:
@@ -291,14 +304,10 @@ def _phases(
     devices: Devices,
 ) -> list[tuple[_Setup, int]]:
     """List with how many samples to run how many iterations."""
-    if iterations < 1:
-        raise ValueError(f"iterations must be at least 1, got {iterations}")
     ordinary = _make_setup(task, algorithm, samples, devices)
     is_begun = np.any(np.asarray(state.iteration) > 0)
     if first_samples is None or is_begun:
         return [(ordinary, iterations)]
-    if first_samples < 1:
-        raise ValueError(f"first_samples must be at least 1, got {first_samples}")
     phases = [(ordinary._replace(samples=first_samples), 1), (ordinary, iterations - 1)]
     return [(setup, length) for setup, length in phases if length > 0]
 
@@ -325,11 +334,35 @@ def _run(
     return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
 
 
+def _check_callback(on_iteration: OnIteration | None) -> None:
+    if on_iteration is not None:
+        checks.function("on_iteration", on_iteration, "(state, log)")
+
+
+def _checked_state(name: str, state: CrepsState) -> CrepsState:
+    """Return a state, its policy as arrays; whether it is of the algorithm, `ask` and `tell` will see."""
+    checks.instance(name, state, CrepsState)
+    checks.instance(f"{name}.policy", state.policy, LinearGaussian)
+    checks.instance(f"{name}.archive", state.archive, Archive)
+    fields = {field: checks.array(f"{name}.policy.{field}", x) for field, x in state.policy._asdict().items()}
+    return state._replace(policy=LinearGaussian(**fields))
+
+
+def _checked_start(start: CrepsState) -> CrepsState:
+    start = _checked_state("start", start)
+    for field, values in start.policy._asdict().items():
+        checks.finite(f"start.policy.{field}", values)
+    return start
+
+
 def _check_fit(task: Task, state: CrepsState) -> None:
-    theta_dim, context_dim = state.policy.coef.shape[1], state.archive.batch.context.shape[1]
-    if theta_dim != task.theta_dim:
-        raise ValueError(f"the policy gives {theta_dim} parameters, the task takes {task.theta_dim}")
-    if context_dim != task.context_dim:
+    coef, context = state.policy.coef, state.archive.batch.context
+    if coef.shape[-1:] != (task.theta_dim,):
         raise ValueError(
-            f"the features take {context_dim} context variables, the task has {task.context_dim}"
+            f"the policy must give the task's {task.theta_dim} parameters, got coef of shape {coef.shape}"
+        )
+    if context.shape[-1:] != (task.context_dim,):
+        raise ValueError(
+            f"the features must take the task's {task.context_dim} context variables, "
+            f"got an archive of shape {context.shape}"
         )

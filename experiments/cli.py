@@ -158,7 +158,10 @@ Command = (
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the arguments ask for and return the exit code: 2 for a mistake, 130 for an interrupt."""
+    """Do what the arguments ask for and return the exit code: 2 for a mistake, 130 for an interrupt.
+
+    What the file system refuses is told in one line as well, wherever it turns up.
+    """
     if not arguments or list(arguments) in (["-h"], ["--help"], ["help"]):
         print(OVERVIEW, end="")
         return 0
@@ -166,8 +169,9 @@ def main(arguments: Sequence[str]) -> int:
         Command, args=list(arguments), prog="python -m experiments", config=(FlagCreatePairsOff,)
     )  # type: ignore[arg-type]
     try:
+        _check_seed(getattr(command, "seed", None))
         return _HANDLERS[type(command)](command)
-    except UserError as error:
+    except (UserError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -176,6 +180,11 @@ def main(arguments: Sequence[str]) -> int:
 
 def _say(line: str) -> None:
     print(line, flush=True)
+
+
+def _check_seed(seed: int | None) -> None:
+    if seed is not None and not 0 <= seed < 2**32:
+        raise UserError(f"seed must be from 0 to {2**32 - 1}, got {seed}")
 
 
 def _list(_: List) -> int:

@@ -160,7 +160,7 @@ def load_policy(path: Path) -> SavedPolicy:
     arrays = load_arrays(Path(path))
     if str(arrays.get("format")) != FORMAT:
         raise UserError(f"{path} is no policy file (its format is not {FORMAT!r})")
-    if int(arrays.get("version", -1)) != VERSION:
+    if str(arrays.get("version")) != str(VERSION):
         raise UserError(f"{path} is a policy file of version {arrays.get('version')}, expected {VERSION}")
     try:
         context_low, context_high = arrays["context_range"].tolist()
@@ -199,12 +199,19 @@ def _check(path: Path, saved: SavedPolicy) -> None:
         )
     numbers = [saved.coef, saved.cov_chol, saved.param_low, saved.param_high]
     numbers += [saved.context_low, saved.context_high]
-    if not all(np.all(np.isfinite(values)) for values in numbers):
+    try:
+        is_finite = all(np.all(np.isfinite(values)) for values in numbers)
+    except TypeError:
+        raise UserError(f"{path}: the policy holds something else where numbers are expected") from None
+    if not is_finite:
         raise UserError(f"{path}: the policy holds numbers that are not finite")
     if not len(saved.context_names) == len(saved.context_units) == len(saved.context_low):
         raise UserError(f"{path}: expected a unit and a range for each of {', '.join(saved.context_names)}")
     num_params = len(saved.param_names)
-    wanted = (saved.feature_map().size, num_params)
+    try:
+        wanted = (saved.feature_map().size, num_params)
+    except ValueError as error:
+        raise UserError(f"{path}: {error}") from error
     if np.shape(saved.coef) != wanted or np.shape(saved.cov_chol) != (num_params, num_params):
         raise UserError(
             f"{path}: expected coef {wanted} and cov_chol {(num_params, num_params)}, "
@@ -212,3 +219,6 @@ def _check(path: Path, saved: SavedPolicy) -> None:
         )
     if not len(saved.param_units) == len(saved.param_low) == len(saved.param_high) == num_params:
         raise UserError(f"{path}: expected units and bounds for each of the {num_params} parameters")
+    for name, low, high in zip(saved.param_names, saved.param_low, saved.param_high, strict=True):
+        if low > high:
+            raise UserError(f"{path}: the bounds of {name} must be in order, got {low} and {high}")

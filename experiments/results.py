@@ -168,6 +168,20 @@ def new_folder(parent: Path, name: str) -> Path:
     raise UserError(f"cannot make a result folder in {parent}: too many are named {name}")
 
 
+def check_writable(folder: Path) -> None:
+    """See that a folder can be made and written to, before work is done whose result goes there.
+
+    Raises:
+        UserError: if it cannot.
+    """
+    try:
+        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise UserError(f"cannot write to the folder {folder}: {error.strerror or error}") from error
+
+
 def stamp() -> str:
     """Return the local time as a folder name, sorted as time goes."""
     return datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -181,7 +195,7 @@ def latest_folder(experiment: str, *, status: str | None = None, root: Path | No
         with contextlib.suppress(UserError):
             manifest = load_manifest(path.parent)
             if status is None or manifest.get("status") == status:
-                found.append((manifest.get("started", ""), path.parent))
+                found.append((str(manifest.get("started")), path.parent))
     return max(found)[1] if found else None
 
 

@@ -1,8 +1,9 @@
 """Run an experiment into a result folder, go on with one, draw its figures again, check its claims."""
 
+import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from experiments.learning import Session
 from experiments.tables import to_markdown
 
 Say = Callable[[str], None]
+
+_MOST = {"iterations": 1_000_000, "trials": 1_000}
+"""What a run can hold in memory, by setting."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,11 +111,15 @@ def plot(name: str, folder: Path | None, *, say: Say) -> Path:
     """Draw the figures of a result folder again, by default of the latest one, and return the folder.
 
     Raises:
-        UserError: if there are no results to draw.
+        UserError: if there are no results to draw, or they are those of another experiment.
     """
     experiment = registry.load(name)
     folder = folder or _latest_finished(name)
-    _draw(experiment, results.load_arrays(folder / results.ARRAYS), folder, say)
+    found = results.load_manifest(folder).get("experiment")
+    if found != name:
+        raise UserError(f"{folder} holds results of {found}, expected those of {name}")
+    with _whole_results(folder):
+        _draw(experiment, results.load_arrays(folder / results.ARRAYS), folder, say)
     return folder
 
 
@@ -127,7 +135,8 @@ def check(names: tuple[str, ...], *, say: Say) -> bool:
         if folder is None:
             say(f"{name}: no results yet (python -m experiments run {name})\n")
             continue
-        rows = claim_rows(registry.load(name), results.load_arrays(folder / results.ARRAYS))
+        with _whole_results(folder):
+            rows = claim_rows(registry.load(name), results.load_arrays(folder / results.ARRAYS))
         all_hold &= all(row["holds"] for row in rows)
         say(f"{name}: {folder}\n\n{_claims_table(rows)}")
     return all_hold
@@ -161,6 +170,9 @@ def _started(experiment: registry.Experiment, request: Request) -> tuple[Any, Pa
         )
     elif folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file, expected a folder")
+    elif folder.exists() and (foreign := [p.name for p in folder.iterdir() if not p.name.startswith(".")]):
+        # What is there might have the names of what a run writes.
+        raise UserError(f"{folder} holds files of something else, {min(foreign)} for one: name a new folder")
     return settings, folder, results.make_manifest(request.name, preset, settings, request.seed or 0)
 
 
@@ -176,6 +188,11 @@ def _resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Pa
         if folder is None:
             raise UserError(f"there is no unfinished run of {request.name} in {results.default_root()}")
     manifest = results.load_manifest(folder)
+    for field, kind in (("seed", int), ("seconds", float | int)):
+        if not isinstance(manifest.get(field), kind):
+            raise UserError(
+                f"{folder} has no {field} in its manifest, expected a number: it cannot be resumed"
+            )
     for field, asked in (("experiment", request.name), ("preset", request.preset), ("seed", request.seed)):
         if asked is not None and manifest.get(field) != asked:
             raise UserError(
@@ -201,6 +218,8 @@ def _override(settings: Any, request: Request) -> Any:
             raise UserError(f"{request.name} has no setting {name!r}")
         if isinstance(value, int) and value < 1:
             raise UserError(f"{name} must be at least 1, got {value}")
+        if name in _MOST and value > _MOST[name]:
+            raise UserError(f"{name} must be at most {_MOST[name]}, got {value}")
     return dataclasses.replace(settings, **request.overrides)
 
 
@@ -234,6 +253,17 @@ def _claims_table(rows: list[dict[str, Any]]) -> str:
         "holds": ["yes" if row["holds"] else "NO" for row in rows],
     }
     return to_markdown(columns)
+
+
+@contextlib.contextmanager
+def _whole_results(folder: Path) -> Iterator[None]:
+    """Name arrays that results lack, of another version for example, as the user's to mend."""
+    try:
+        yield
+    except KeyError as error:
+        raise UserError(
+            f"{folder / results.ARRAYS} lacks {error}: it is of another version or experiment"
+        ) from error
 
 
 def _latest_finished(name: str) -> Path:

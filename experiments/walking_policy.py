@@ -1,5 +1,6 @@
 """Use a walking policy: record its walks, show one of them, film several side by side."""
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from experiments.video import Clip, VideoError, write_video
 
 POLICY = "policy.npz"
 START_UP = 2.0
+_MOST_WALKS = 24
 
 
 def show(speed: float, path: Path | None, *, out: Path | None, seed: int, say: Callable[[str], None]) -> None:
@@ -37,10 +39,12 @@ def show(speed: float, path: Path | None, *, out: Path | None, seed: int, say: C
     path = path or default_policy()
     policy = load_walking_policy(path)
     theta = policy.theta(speed)
+    folder = out or results.default_root() / "walk"
+    results.check_writable(folder)
     say(f"policy: {path}")
     for name, unit, value in zip(policy.param_names, policy.param_units, theta, strict=True):
         say(f"  {name.replace('_', ' '):16}{value:8.4f} {unit}".rstrip())
-    video = (out or results.default_root() / "walk") / f"walk-{speed:.2f}.mp4"
+    video = folder / f"walk-{speed:.2f}.mp4"
     clips = record(policy, (speed,), seed=seed)
     say(clips[0].caption)
     save_film(clips, video, say)
@@ -52,8 +56,14 @@ def film(
     """Film a policy at several speeds, side by side.
 
     Raises:
-        UserError: if the policy is unreadable, or a speed is outside its range.
+        UserError: if the policy is unreadable, a speed is outside its range or there are too many, or the
+            video cannot be written.
     """
+    if out.suffix != ".mp4" or out.is_dir():
+        raise UserError(f"a video must be an .mp4 file, got {out}")
+    if len(speeds) > _MOST_WALKS:
+        raise UserError(f"a video must show at most {_MOST_WALKS} walks, got {len(speeds)} speeds")
+    results.check_writable(out.parent)
     clips = record(load_walking_policy(path or default_policy()), speeds, seed=seed)
     for clip in clips:
         say(clip.caption)
@@ -140,12 +150,14 @@ def load_walking_policy(path: Path) -> SavedPolicy:
     if policy.param_names != PARAM_NAMES:
         raise UserError(f"{path} is no walking policy: its parameters are {', '.join(policy.param_names)}")
     try:
-        balance_of(policy)
+        is_finite = all(math.isfinite(gain) for gain in balance_of(policy))  # type: ignore[arg-type]
     except (KeyError, TypeError):
+        is_finite = False
+    if not is_finite:
         wanted = ", ".join(Balance._fields)
         raise UserError(
-            f"{path} does not say how its steps were balanced: expected {wanted}, got {dict(policy.task)}"
-        ) from None
+            f"{path} does not say how its steps were balanced: expected {wanted}, got {policy.task}"
+        )
     return policy
 
 

@@ -64,5 +64,5 @@ def test_penalty_is_charged_once_and_only_outside():
 
 @pytest.mark.parametrize("function", [sigmoid_gate, sigmoid_gate_inverse, violation])
 def test_refuses_bounds_that_do_not_fit(function):
-    with pytest.raises(ValueError, match=r"vectors of 3, got shapes \(2,\) and \(\)"):
+    with pytest.raises(ValueError, match=r"got shapes \(3,\), \(2,\) and \(\)"):
         function(jnp.zeros(3), (0.0, 0.0), 1.0)

@@ -166,10 +166,10 @@ def test_takes_any_features_and_several_contexts(key):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"kl_bound": 0}, "kl_bound must be positive and finite, got 0"),
+        ({"kl_bound": 0}, "kl_bound must be finite and above 0, got 0"),
         ({"kl_bound": float("nan")}, "got nan"),
-        ({"archive_size": 0}, "archive_size must be an integer of at least 1, got 0"),
-        ({"ridge": -1.0}, "ridge must be finite and not negative, got -1.0"),
+        ({"archive_size": 0}, "archive_size must be at least 1, got 0"),
+        ({"ridge": -1.0}, "ridge must be finite and at least 0, got -1.0"),
         ({"baseline_features": linear_features(3)}, "same context, got 1 and 3"),
         ({"m_step": bounded_ml}, r"such as bounded_ml\(\), got bounded_ml without its parentheses"),
     ],

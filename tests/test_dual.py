@@ -386,18 +386,18 @@ def test_sample_kl_lies_between_zero_and_the_logarithm_of_the_count():
 
 @pytest.mark.parametrize("kl_bound", [0.0, -1.0, np.nan, np.inf])
 def test_bad_bound_is_named(kl_bound):
-    with pytest.raises(ValueError, match=f"kl_bound has to be a positive number, got {kl_bound}"):
+    with pytest.raises(ValueError, match=f"kl_bound must be finite and above 0, got {kl_bound}"):
         solve_dual(jnp.zeros(3), jnp.zeros((3, 2)), kl_bound=kl_bound)
 
 
 @pytest.mark.parametrize(
     ("reward", "features", "valid", "message"),
     [
-        ((3,), (4, 2), (3,), r"got shapes \(3,\), \(4, 2\)"),
-        ((3, 1), (3, 2), (3,), r"got shapes \(3, 1\), \(3, 2\)"),
-        ((3,), (3,), (3,), r"got shapes \(3,\), \(3,\)"),
-        ((3,), (3, 0), (3,), r"got shapes \(3,\), \(3, 0\)"),
-        ((3,), (3, 2), (4,), r"the shape of reward, \(3,\), got \(4,\)"),
+        ((3,), (4, 2), (3,), r"got shapes \(3,\) and \(4, 2\)"),
+        ((3, 1), (3, 2), (3,), r"got shapes \(3, 1\) and \(3, 2\)"),
+        ((3,), (3,), (3,), r"got shapes \(3,\) and \(3,\)"),
+        ((3,), (3, 0), (3,), r"got shapes \(3,\) and \(3, 0\)"),
+        ((3,), (3, 2), (4,), r"valid must have shape \(3,\), got \(4,\)"),
     ],
 )
 def test_bad_shapes_are_named(reward, features, valid, message):

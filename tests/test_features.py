@@ -98,14 +98,14 @@ def test_radial_is_smooth_across_the_ends_of_the_range():
 @pytest.mark.parametrize(
     ("args", "bandwidth", "message"),
     [
-        ((1.0, 1.0, 3), None, "low has to be below high, both finite, got low=1.0 and high=1.0"),
-        ((2.0, 1.0, 3), None, "got low=2.0 and high=1.0"),
-        (((0.0, 1.0), (1.0, 0.5), 3), None, "low has to be below high"),
-        ((0.0, float("inf"), 3), None, "both finite"),
-        ((float("nan"), 1.0, 3), None, "both finite"),
-        (((0.0, 0.0), 1.0, 3), None, r"got shapes \(2,\) and \(1,\)"),
-        ((0.0, 1.0, 0), None, "whole number >= 1, got 0"),
-        ((0.0, 1.0, 3), 0.0, "bandwidth has to be finite and above zero, got 0.0"),
+        ((1.0, 1.0, 3), None, r"low must be below high, got \[1\.\] and \[1\.\]"),
+        ((2.0, 1.0, 3), None, r"got \[2\.\] and \[1\.\]"),
+        (((0.0, 1.0), (1.0, 0.5), 3), None, "low must be below high"),
+        ((0.0, float("inf"), 3), None, "high must be finite, got inf"),
+        ((float("nan"), 1.0, 3), None, "low must be finite, got nan"),
+        (((0.0, 0.0), 1.0, 3), None, r"one length, got \(2,\) and \(1,\)"),
+        ((0.0, 1.0, 0), None, "num_centers must be at least 1, got 0"),
+        ((0.0, 1.0, 3), 0.0, "bandwidth must be above zero, got 0.0"),
         ((0.0, 1.0, 3), float("nan"), "got nan"),
         ((0.0, 1.0, 3), (0.1, 0.2), "as long as low, 1, got"),
     ],
@@ -117,5 +117,5 @@ def test_bad_radial_settings_are_named(args, bandwidth, message):
 
 @pytest.mark.parametrize("make", [linear_features, quadratic_features])
 def test_bad_dimension_is_named(make):
-    with pytest.raises(ValueError, match="context variables >= 1, got 0"):
+    with pytest.raises(ValueError, match="dim must be at least 1, got 0"):
         make(0)

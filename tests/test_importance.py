@@ -144,7 +144,7 @@ def test_a_state_of_another_setting_is_refused(key):
     ("settings", "message"),
     [
         ((0,), "num_policies must be at least 1, got 0"),
-        ((5, 0.5), "least_effective must be at least 1, got 0.5"),
+        ((5, 0.5), "least_effective must be finite and at least 1, got 0.5"),
     ],
 )
 def test_settings_out_of_range_are_refused(settings, message):

@@ -1,7 +1,5 @@
 """Solvers agree with dense float64 references, and stay finite where those would fail."""
 
-import inspect
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,8 +60,8 @@ def test_thomas_has_gradients():
 
 
 def test_thomas_names_bad_shapes():
-    with pytest.raises(ValueError, match=r"one length n >= 1, got shapes .*\(4,\).*\(3,\)"):
-        inspect.unwrap(thomas_solve)(jnp.ones(4), jnp.ones(4), jnp.ones(4), jnp.ones(3))
+    with pytest.raises(ValueError, match=r"rhs must have shape \(4,\) beside lower \(4,\) .*, got \(3,\)"):
+        thomas_solve(jnp.ones(4), jnp.ones(4), jnp.ones(4), jnp.ones(3))
 
 
 # Regression.

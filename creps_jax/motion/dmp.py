@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float
 
 __all__ = ["DmpTrajectory", "dmp_trajectory", "fit_dmp"]
@@ -32,6 +33,7 @@ class DmpTrajectory(NamedTuple):
     acc: Float[Array, "n d"]
 
 
+@checks.arguments
 def dmp_trajectory(
     weights: Float[Array, "b d"],
     start: Float[Array, " d"],
@@ -66,15 +68,7 @@ def dmp_trajectory(
     Source: Ijspeert et al. 2013, Eq. 2.1 to 2.5, without scaling by the amplitude, which fails where start
     and goal are equal; the forcing is divided by the spring's stiffness.
     """
-    if num_steps < 1:
-        raise ValueError(f"num_steps must be at least 1, got {num_steps}")
-    if not duration > 0:
-        raise ValueError(f"duration must be positive, got {duration}")
-    if weights.ndim != 2 or len(weights) == 0 or not start.shape == goal.shape == weights.shape[1:]:
-        raise ValueError(
-            f"start and goal must have an entry for each column of weights, which has one row or more, "
-            f"got weights {weights.shape}, start {start.shape} and goal {goal.shape}"
-        )
+    checks.number("duration", duration, above=0.0)
     dtype = weights.dtype
     middles = (jnp.arange(num_steps, dtype=dtype) + 0.5) / num_steps
     rest = goal[None] + _forcing_bases(middles, weights.shape[0]) @ weights
@@ -96,6 +90,7 @@ def dmp_trajectory(
     return DmpTrajectory(pos, vel / duration, acc / duration**2)
 
 
+@checks.arguments
 def fit_dmp(pos: Float[Array, "n d"], num_basis: int) -> Float[Array, "b d"]:
     """Fit weights to a demonstration that starts at rest, by least squares of the positions.
 
@@ -112,11 +107,8 @@ def fit_dmp(pos: Float[Array, "n d"], num_basis: int) -> Float[Array, "b d"]:
     Raises:
         ValueError: If the demonstration has fewer steps than there are bases, or there is no basis.
     """
-    if num_basis < 1 or pos.ndim != 2 or pos.shape[0] <= num_basis:
-        raise ValueError(
-            f"a demonstration (n, d) must have more positions than bases, at least 1, "
-            f"got shape {pos.shape} and {num_basis} bases"
-        )
+    if pos.shape[0] <= num_basis:
+        raise ValueError(f"num_basis must be less than the {pos.shape[0]} positions of pos, got {num_basis}")
     num_steps = pos.shape[0] - 1
 
     def moved(weights, start, goal):

@@ -11,6 +11,8 @@ of a side can be vmapped over both legs.
 from math import radians
 from typing import NamedTuple
 
+from creps_jax import checks
+
 __all__ = [
     "GEOMETRY",
     "JOINT_LOWER",
@@ -127,6 +129,7 @@ MAX_JOINT_TORQUE = 10.0
 """Largest torque of every motor (N m)."""
 
 
+@checks.arguments
 def leg_indices(side: float | int) -> slice:
     """Return where a leg's six joints lie in a joint vector (or in `JOINT_NAMES`), for `LEFT` or `RIGHT`.
 

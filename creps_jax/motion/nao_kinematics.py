@@ -15,9 +15,11 @@ because the hip yaw-pitch axis, (0, 1, -s) / sqrt 2, is the z axis turned by 45 
 from math import atan2, cos, hypot, pi, sqrt
 
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_UPPER, LEFT, leg_indices
+from creps_jax import checks
+from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_UPPER, LEFT, RIGHT, leg_indices
 from creps_jax.rotations import rigid_transform, rotation_x, rotation_y, rotation_z, safe_arctan2
 from creps_jax.typing import Scalar, ScalarLike
 
@@ -51,14 +53,19 @@ _ROLL_FOLD = 0.003
 _TINY = 1e-8
 
 
+@checks.arguments
 def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike) -> Float[Array, "4 4"]:
     """Return the pose of the sole in the torso frame, `T_torso_sole`.
 
     Args:
         joint_pos: the six joint angles of the leg (rad).
         side: `LEFT` (+1) or `RIGHT` (-1).
+
+    Raises:
+        ValueError: If there are not six finite angles, or `side` is neither side.
     """
-    side = jnp.asarray(side, joint_pos.dtype)
+    checks.finite("joint_pos", joint_pos)
+    side = _checked_side(side, joint_pos.dtype)
     yaw_pitch, hip_roll, hip_pitch, knee, ankle_pitch, ankle_roll = joint_pos
     tilt = side * _HIP_TILT
     R_torso_thigh = (
@@ -81,6 +88,7 @@ def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike) -> Float[Array, "4 4"
     return rigid_transform(R_torso_sole, position)
 
 
+@checks.arguments
 def leg_ik(T_torso_sole: Float[Array, "4 4"], side: ScalarLike) -> Float[Array, "6"]:
     """Return the joint angles that bring the sole to a pose in the torso frame, the inverse of `leg_fk`.
 
@@ -95,8 +103,12 @@ def leg_ik(T_torso_sole: Float[Array, "4 4"], side: ScalarLike) -> Float[Array, 
     Args:
         T_torso_sole: wanted pose of the sole in the torso frame (m).
         side: `LEFT` (+1) or `RIGHT` (-1).
+
+    Raises:
+        ValueError: If the pose is no finite matrix (4, 4), or `side` is neither side.
     """
-    side = jnp.asarray(side, T_torso_sole.dtype)
+    checks.finite("T_torso_sole", T_torso_sole)
+    side = _checked_side(side, T_torso_sole.dtype)
     R_torso_sole, position = T_torso_sole[:3, :3], T_torso_sole[:3, 3]
 
     # The pitch joints move the hip within the xz plane of the ankle; the roll turns the hip into that plane.
@@ -137,6 +149,12 @@ def _solve_hip(R_torso_thigh: Float[Array, "3 3"], side: Scalar) -> tuple[Scalar
     second = jnp.arctan2(rotation[2, 1], c * rotation[1, 1] - s * rotation[0, 1])
     third = jnp.arctan2(c * rotation[0, 2] + s * rotation[1, 2], c * rotation[0, 0] + s * rotation[1, 0])
     return -side * first, second + tilt, -third
+
+
+def _checked_side(side: ScalarLike, dtype: jnp.dtype) -> Array:
+    if not isinstance(side, Tracer) and side not in (LEFT, RIGHT):
+        raise ValueError(f"side must be LEFT ({LEFT}) or RIGHT ({RIGHT}), got {side!r}")
+    return jnp.asarray(side, dtype)
 
 
 def _hip_position(side: Scalar) -> Float[Array, "3"]:

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
+from creps_jax import checks
 from creps_jax.physics.servos import read_servos
 from creps_jax.physics.state import ControlStep, RobotState, substep_shares
 from creps_jax.physics.world import World, changed_fields, world_of
@@ -23,6 +24,7 @@ _LARGEST = 1e10
 """A state beyond this is taken for bad, as C MuJoCo takes it."""
 
 
+@checks.arguments
 def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     """Return the function that steps the robot through one control step, on the host's cores.
 

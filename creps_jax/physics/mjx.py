@@ -9,6 +9,7 @@ from jax import lax
 from jax.scipy.linalg import cho_factor, cho_solve
 from mujoco import mjx
 
+from creps_jax import checks
 from creps_jax.physics.servos import Servos, read_servos
 from creps_jax.physics.state import ControlStep, RobotState, substep_shares
 from creps_jax.physics.world import World, changed_fields
@@ -20,6 +21,7 @@ _POSITION_STAGES = (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.collision, mjx.mak
 _VELOCITY_STAGES = (mjx.com_vel, mjx.passive, mjx.rne)
 
 
+@checks.arguments
 def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     """Return the function that steps the robot through one control step.
 

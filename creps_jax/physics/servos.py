@@ -5,6 +5,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
+from creps_jax import checks
 from creps_jax.typing import Float, Int
 
 __all__ = ["Servos", "read_servos"]
@@ -35,6 +36,7 @@ class Servos(NamedTuple):
         return self.damping / self.stiffness
 
 
+@checks.arguments
 def read_servos(model: mujoco.MjModel) -> Servos:
     """Read the servos out of a model.
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float
 
 __all__ = ["ControlStep", "RobotState", "initial_state", "substep_shares"]
@@ -33,18 +34,18 @@ a batch has where a robot has fallen, gives any state.
 """
 
 
+@checks.arguments
 def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:
     """Return the state at rest in a position."""
     zeros = jnp.zeros(num_velocities, qpos.dtype)
     return RobotState(qpos, zeros, zeros)
 
 
+@checks.arguments
 def substep_shares(num_substeps: int) -> Float[np.ndarray, " n"]:
     """Return which share of the way from one set-point to the next each physics step of a control step has.
 
     Raises:
         ValueError: If there is no substep.
     """
-    if num_substeps < 1:
-        raise ValueError(f"num_substeps must be at least 1, got {num_substeps}")
     return np.arange(1, num_substeps + 1) / num_substeps

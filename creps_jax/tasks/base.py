@@ -5,6 +5,7 @@ outcome. Everything is written for one rollout; the caller vmaps.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -12,10 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from creps_jax import constraints
+from creps_jax import checks, constraints
 from creps_jax.typing import Array, Float, PRNGKey, VectorLike
 
-__all__ = ["Outcome", "PlainOutcome", "Task", "average_repeats", "penalised", "sigmoid_constrained"]
+__all__ = [
+    "Outcome",
+    "PlainOutcome",
+    "Task",
+    "average_repeats",
+    "penalised",
+    "sigmoid_constrained",
+]
 
 
 @runtime_checkable
@@ -64,7 +72,34 @@ class Task:
     theta_dim: int
     worst_reward: float | int
 
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        checks.function("sample_context", self.sample_context, "(key) -> context")
+        checks.function("rollout", self.rollout, "(key, context, theta) -> outcome")
+        checks.count("context_dim", self.context_dim)
+        checks.count("theta_dim", self.theta_dim)
+        # An array could not be compiled for.
+        object.__setattr__(self, "worst_reward", checks.number("worst_reward", self.worst_reward))
 
+
+def check_outcome(outcome: Any) -> Any:
+    """Return what a rollout gave, after checking that it is an outcome of arrays with one reward.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if not isinstance(outcome, Outcome):
+        raise ValueError(
+            "a rollout must return an Outcome, a NamedTuple with reward and violation such as PlainOutcome, "
+            f"got {checks.shown(outcome)}"
+        )
+    checks.array("the reward of a rollout", outcome.reward, ())
+    for leaf in jax.tree.leaves(outcome):
+        checks.array("each field of a rollout's outcome", leaf)
+    return outcome
+
+
+@checks.arguments
 def average_repeats(task: Task, repeats: int) -> Task:
     """Average every rollout over repeats with keys of their own (Abdolmaleki et al. 2016, 4.3.1).
 
@@ -79,17 +114,17 @@ def average_repeats(task: Task, repeats: int) -> Task:
     Raises:
         ValueError: If repeats < 1.
     """
-    if repeats < 1:
-        raise ValueError(f"repeats must be at least 1, got {repeats}")
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
-        keys = jax.random.split(key, repeats)
-        outcomes = jax.vmap(task.rollout, in_axes=(0, None, None))(keys, context, theta)
+        keys = jax.random.split(checks.key("key", key), repeats)
+        single = lambda *arguments: check_outcome(task.rollout(*arguments))  # noqa: E731
+        outcomes = jax.vmap(single, in_axes=(0, None, None))(keys, context, theta)
         return jax.tree.map(_mean_of_repeats, outcomes)
 
     return dataclasses.replace(task, rollout=rollout)
 
 
+@checks.arguments
 def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
     """Let theta be free and squash it into [low, high] (Abdolmaleki et al. 2016, Eq. 17).
 
@@ -107,12 +142,13 @@ def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
     low, high = _checked_bounds(task, low, high)
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
-        gated = constraints.sigmoid_gate(theta, low, high)
-        return task.rollout(key, context, gated)
+        theta = checks.array("theta", theta, (task.theta_dim,))
+        return task.rollout(key, context, constraints.sigmoid_gate(theta, low, high))
 
     return dataclasses.replace(task, rollout=rollout)
 
 
+@checks.arguments
 def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | int) -> Task:
     """Charge a penalty where theta leaves [low, high] (the 1_p of Abdolmaleki et al. 2016, Eq. 18).
 
@@ -132,13 +168,13 @@ def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | in
     Raises:
         ValueError: If the bounds do not fit the task or each other, or the penalty is negative.
     """
-    low, high = _checked_bounds(task, low, high)
-    if not penalty >= 0:
-        raise ValueError(f"penalty must not be negative, got {penalty}")
+    low, high = _checked_bounds(task, low, high, largest=math.inf)
+    checks.number("penalty", penalty, least=0.0)
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
+        theta = checks.array("theta", theta, (task.theta_dim,))
         violation = constraints.violation(theta, low, high)
-        outcome = task.rollout(key, context, jnp.clip(theta, low, high))
+        outcome = check_outcome(task.rollout(key, context, jnp.clip(theta, low, high)))
         return outcome._replace(
             reward=outcome.reward - constraints.penalty(violation, penalty), violation=violation
         )
@@ -151,14 +187,19 @@ def _mean_of_repeats(field: Array) -> Array:
     return jnp.mean(field if is_float else field.astype(jnp.float32), axis=0)
 
 
-def _checked_bounds(task: Task, low: VectorLike, high: VectorLike) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
+def _checked_bounds(
+    task: Task, low: VectorLike, high: VectorLike, *, largest: float = checks.FLOAT32_MAX
+) -> tuple[np.ndarray, np.ndarray]:
+    low, high = (
+        checks.vector(name, end, largest=largest).astype(np.float32)
+        for name, end in (("low", low), ("high", high))
+    )
     shape = (task.theta_dim,)
     if not {low.shape, high.shape} <= {(), shape}:
         raise ValueError(
-            f"bounds must be numbers or one for each of the task's {task.theta_dim} parameters, "
+            f"low and high must be numbers or one for each of the task's {task.theta_dim} parameters, "
             f"got shapes {low.shape} and {high.shape}"
         )
     if not np.all(low <= high):
-        raise ValueError(f"lower bounds must not exceed upper bounds, got {low} and {high}")
+        raise ValueError(f"low must not exceed high, got {low} and {high}")
     return np.broadcast_to(low, shape), np.broadcast_to(high, shape)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from creps_jax import checks
 from creps_jax.physics.world import World
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
@@ -62,6 +63,7 @@ class Condition(NamedTuple):
     begins: float = 0.0
 
 
+@checks.arguments
 def slope(low: float, high: float) -> Condition:
     """Let the floor rise ahead of the robot, by an angle in degrees; below zero it falls.
 
@@ -88,6 +90,7 @@ def slope(low: float, high: float) -> Condition:
     return _checked(Condition("slope", "deg", low, high, apply), above=-90.0, below=90.0)
 
 
+@checks.arguments
 def payload(low: float, high: float) -> Condition:
     """Load the torso with a mass at its centre, in kg.
 
@@ -101,6 +104,7 @@ def payload(low: float, high: float) -> Condition:
     return _checked(Condition("payload", "kg", low, high, apply), least=0.0)
 
 
+@checks.arguments
 def friction(low: float, high: float) -> Condition:
     """Let feet slide at so many times the friction of the robot's model, whose coefficient is 1 for the NAO.
 
@@ -114,6 +118,7 @@ def friction(low: float, high: float) -> Condition:
     return _checked(Condition("friction", "", low, high, apply), above=0.0)
 
 
+@checks.arguments
 def push(low: float, high: float, *, time: float = 3.0) -> Condition:
     """Push the robot once: all of it moves faster to the left at once, by a velocity in m/s.
 
@@ -130,8 +135,7 @@ def push(low: float, high: float, *, time: float = 3.0) -> Condition:
     Raises:
         ValueError: If the range is not in order, or the time is not positive.
     """
-    if not time > 0:
-        raise ValueError(f"a push must come at a positive time, got {time}")
+    checks.number("time", time, above=0.0)
 
     def apply(circumstances: Circumstances, value: Scalar) -> Circumstances:
         return circumstances._replace(push=value, push_time=time)
@@ -139,12 +143,15 @@ def push(low: float, high: float, *, time: float = 3.0) -> Condition:
     return _checked(Condition("push", "m/s", low, high, apply, begins=time))
 
 
+@checks.arguments
 def check_conditions(conditions: Sequence[Condition], duration: float) -> None:
     """Refuse conditions that a walk of this duration, in s, cannot have.
 
     Raises:
         ValueError: If two have one name, of which the last would count, or one begins after the end.
     """
+    if not isinstance(conditions, Sequence) or not all(isinstance(each, Condition) for each in conditions):
+        raise ValueError(f"conditions must be a list of Condition, got {checks.shown(conditions)}")
     names = [condition.name for condition in conditions]
     if len(set(names)) < len(names):
         raise ValueError(f"every condition must have a name of its own, got {', '.join(names)}")
@@ -163,8 +170,8 @@ def circumstances_of(
     Raises:
         ValueError: If there is not one value for each condition.
     """
-    if values.shape != (len(conditions),):
-        raise ValueError(f"{len(conditions)} conditions need as many values, got shape {values.shape}")
+    checks.instance("world", world, World)
+    values = checks.array("values", values, (len(conditions),), note=", one for each of the conditions")
     if not conditions:
         return None
     circumstances = Circumstances(world)
@@ -173,12 +180,14 @@ def circumstances_of(
     return circumstances
 
 
+@checks.arguments
 def upward(world: World) -> Float[Array, "3"]:
     """Return the direction against gravity, in the frame of the floor."""
     gravity = jnp.asarray(world.gravity)
     return -gravity / jnp.linalg.norm(gravity)
 
 
+@checks.arguments
 def slope_angle(world: World) -> Scalar:
     """Return by how much the floor rises ahead, rad: as far forward a trunk leans from it that is upright."""
     up = upward(world)
@@ -194,10 +203,9 @@ def _checked(
         ValueError: If it is not.
     """
     name, _, low, high, *_ = condition
-    if not (low < high and np.all(np.isfinite([low, high]))):
-        raise ValueError(f"the lowest {name} must be below the highest, both finite, got {low} and {high}")
+    checks.ends(low, high)
     if not (low > above and low >= least and high < below):
         limits = {"above": above, "at least": least, "below": below}
         wanted = " and ".join(f"{word} {limit:g}" for word, limit in limits.items() if np.isfinite(limit))
-        raise ValueError(f"the {name} must be {wanted}, got {low} to {high}")
+        raise ValueError(f"low and high of the {name} must be {wanted}, got {low} and {high}")
     return condition

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.contexts import uniform_contexts
 from creps_jax.tasks.base import PlainOutcome, Task
 from creps_jax.typing import Array, Float, PRNGKey, Scalar
@@ -12,6 +13,7 @@ from creps_jax.typing import Array, Float, PRNGKey, Scalar
 __all__ = ["ackley", "contextual_function", "ellipsoid", "rastrigin", "rosenbrock", "sphere"]
 
 
+@checks.arguments
 def contextual_function(
     function: Callable[[Float[Array, " d"]], Scalar],
     transform: Float[Array, "d s"],
@@ -36,17 +38,19 @@ def contextual_function(
         The task, with uniform contexts; it has no noise.
 
     Raises:
-        ValueError: If `transform` is not a matrix, or the range is not in order.
+        ValueError: If `transform` is no finite matrix, or the range is not in order.
 
     Source: Abdolmaleki et al. 2017, Contextual covariance matrix adaptation evolutionary strategies,
     Section 4.1.
     """
-    if jnp.ndim(transform) != 2:
-        raise ValueError(f"transform must have shape (d, s), got {jnp.shape(transform)}")
-    theta_dim, context_dim = jnp.shape(transform)
+    checks.function("function", function, "(x) -> number")
+    checks.finite("transform", transform)
+    theta_dim, context_dim = transform.shape
 
     def rollout(key: PRNGKey, context: Float[Array, " s"], theta: Float[Array, " d"]) -> PlainOutcome:
         del key
+        context = checks.array("context", context, (context_dim,))
+        theta = checks.array("theta", theta, (theta_dim,))
         moved = theta + jnp.sum(jnp.asarray(transform, theta.dtype) * context[None], axis=1)
         return PlainOutcome(-function(moved), jnp.zeros(0, theta.dtype))
 
@@ -54,26 +58,31 @@ def contextual_function(
     return Task(sample_context, rollout, context_dim, theta_dim, worst_reward=-1e30)
 
 
+@checks.arguments
 def sphere(x: Float[Array, " d"]) -> Scalar:
     """Return the sum of squares: round, with the minimum 0 at 0."""
     return jnp.sum(x**2)
 
 
+@checks.arguments
 def ellipsoid(x: Float[Array, " d"]) -> Scalar:
     """Return a sum of squares whose weights rise from 1 to 1e6: long and narrow, with the minimum 0 at 0."""
     return jnp.sum(10.0 ** jnp.linspace(0.0, 6.0, x.size, dtype=x.dtype) * x**2)
 
 
+@checks.arguments
 def rosenbrock(x: Float[Array, " d"]) -> Scalar:
     """Return Rosenbrock's function of two variables or more: a bent valley, with the minimum 0 at 1."""
     return jnp.sum(100.0 * (x[1:] - x[:-1] ** 2) ** 2 + (1.0 - x[:-1]) ** 2)
 
 
+@checks.arguments
 def rastrigin(x: Float[Array, " d"]) -> Scalar:
     """Return Rastrigin's function: a sphere under an egg box, with the least of its minima, 0, at 0."""
     return jnp.sum(x**2 + 10.0 * (1.0 - jnp.cos(2.0 * math.pi * x)))
 
 
+@checks.arguments
 def ackley(x: Float[Array, " d"]) -> Scalar:
     """Return Ackley's function: a funnel in a nearly flat egg box, with the least of its minima, 0, at 0."""
     root_mean_square = jnp.sqrt(jnp.mean(x**2))

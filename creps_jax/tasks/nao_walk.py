@@ -1,5 +1,6 @@
 """The walking task: a simulated NAO walks straight ahead, from standstill, at the speed it is asked for."""
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -7,8 +8,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax import lax
 
+from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, NUM_JOINTS
 from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints, stand_upright
@@ -36,6 +39,8 @@ CONTROL_PERIOD = 0.02
 # The torso centre stands .315 m high with the knees bent most; upright means within 50 degrees of it.
 _FALLEN_HEIGHT = 0.2
 _FALLEN_COSINE = 0.64
+# All control steps are planned before the first: a longer episode would fill the memory.
+_LONGEST = 3600.0
 
 
 Physics = Callable[[mujoco.MjModel, int], ControlStep]
@@ -144,6 +149,7 @@ def load_nao() -> mujoco.MjModel:
     raise FileNotFoundError(f"nao/nao.xml is in none of {', '.join(map(str, folders))}")
 
 
+@checks.arguments
 def nao_walk(
     low: float = 0.1,
     high: float = 0.6,
@@ -189,21 +195,22 @@ def nao_walk(
 
     Source: Abdolmaleki et al. 2016, Section 4.3.
     """
-    if not low < high:
-        raise ValueError(f"low must be below high, got {low} and {high}")
+    checks.ends(low, high)
+    _check_numbers("reward", reward)
     if not 0 <= start_up < duration:
         raise ValueError(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
         )
-    check_conditions(conditions, duration)
+    begin, advance = _make_walker(model, duration, noise, balance, physics, conditions)
     if sample_context is None:
         lows, highs = [low, *(c.low for c in conditions)], [high, *(c.high for c in conditions)]
         sample_context = gaussian_contexts(lows, highs, clip=True)
-    begin, advance = _make_walker(model, duration, noise, balance, physics, conditions)
     num_ticks = round(duration / CONTROL_PERIOD)
     start_up_ticks = round(start_up / CONTROL_PERIOD)
 
+    @checks.arguments
     def rollout(key: PRNGKey, context: Float[Array, " s"], theta: Float[Array, "10"]) -> WalkOutcome:
+        context = checks.array("context", context, (1 + len(conditions),))
         walk = begin(key, theta, context[1:])
         start = _Progress(jnp.int32(0), walk.robot, walk.set_point, walk.robot.qpos[:2], jnp.asarray(False))
 
@@ -233,6 +240,7 @@ def nao_walk(
     return Task(sample_context, rollout, 1 + len(conditions), theta_dim=len(PARAM_NAMES), worst_reward=worst)
 
 
+@checks.arguments
 def record_walk(
     key: PRNGKey,
     theta: Float[Array, "10"],
@@ -241,7 +249,7 @@ def record_walk(
     noise: WalkNoise = WalkNoise(),
     balance: Balance = Balance(),
     conditions: Sequence[Condition] = (),
-    values: Float[Array, " k"] | None = None,
+    values: Float[Array, " k"] | Float[np.ndarray, " k"] | None = None,
     model: mujoco.MjModel | None = None,
     physics: Physics = mjx.make_control_step,
 ) -> WalkRecord:
@@ -281,15 +289,21 @@ def record_walk(
 
 
 def _make_walker(model, duration, noise, balance, physics, conditions=()):
-    """Return `begin(key, theta, values)` and `advance(walk, tick, robot, set_point)`."""
+    """Check settings; return `begin(key, theta, values)` and `advance(walk, tick, robot, set_point)`."""
+    if not CONTROL_PERIOD <= duration <= _LONGEST:
+        raise ValueError(f"duration must be {CONTROL_PERIOD} to {_LONGEST:g} s, got {duration}")
+    _check_numbers("noise", noise, least=0.0)
+    _check_numbers("balance", balance)
+    check_conditions(conditions, duration)
+    checks.function("physics", physics, "(model, number of steps) -> control step")
     model = load_nao() if model is None else model
     _check_model(model)
     control_step = physics(model, round(CONTROL_PERIOD / model.opt.timestep))
     num_ticks = round(duration / CONTROL_PERIOD)
 
-    def begin(key: PRNGKey, theta: Array, values: Array | None = None) -> _Walk:
+    def begin(key: PRNGKey, theta: Array, values: Array | np.ndarray | None = None) -> _Walk:
         start_key, lean_key, set_point_key = jax.random.split(key, 3)
-        values = jnp.zeros(0, theta.dtype) if values is None else values
+        values = jnp.zeros(0, theta.dtype) if values is None else checks.array("values", values)
         circumstances = circumstances_of(conditions, values, world_of(model))
         params = params_from_theta(theta)
         plans = plan_walk(params, count_steps(duration))
@@ -355,6 +369,11 @@ def _has_fallen(qpos: Array, circumstances: Circumstances | None) -> Array:
     rotation = quat_to_matrix(qpos[3:7])
     cosine = rotation[2, 2] if circumstances is None else upward(circumstances.world) @ rotation[:, 2]
     return ~(is_high & (cosine > _FALLEN_COSINE))
+
+
+def _check_numbers(name: str, record: WalkReward | WalkNoise | Balance, *, least: float = -math.inf) -> None:
+    for field, value in record._asdict().items():
+        checks.number(f"{name}.{field}", value, least=least)
 
 
 def _check_model(model: mujoco.MjModel) -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.motion.dmp import DmpTrajectory, dmp_trajectory
 from creps_jax.tasks.base import PlainOutcome, Task
@@ -49,6 +50,7 @@ class HoleOutcome(NamedTuple):
     distance: Float[Array, ""]
 
 
+@checks.arguments
 def via_point_reaching(
     low: VectorLike = (-1.5, -1.5),
     high: VectorLike = (-0.5, -0.5),
@@ -70,13 +72,16 @@ def via_point_reaching(
         The task; it has no noise.
 
     Raises:
-        ValueError: If the range is not in order.
+        ValueError: If the range is not in order, or not of two variables.
 
     Source: Abdolmaleki et al. 2016, Section 4.2; the end point (5, 0) in print is out of reach.
     """
+    if checks.vector("low", low).shape != (2,):
+        raise ValueError(f"low must have two entries, of x and y, got {checks.shown(low)}")
     default = gaussian_contexts(low, high, clip=True)
     sample_context = default if sample_context is None else sample_context
 
+    @checks.arguments
     def rollout(key: PRNGKey, context: Float[Array, "2"], theta: Float[Array, "15"]) -> PlainOutcome:
         del key
         movement = via_point_movement(theta)
@@ -89,6 +94,7 @@ def via_point_reaching(
     return Task(sample_context, rollout, context_dim=2, theta_dim=NUM_BASIS * NUM_LINKS, worst_reward=-1e7)
 
 
+@checks.arguments
 def hole_reaching(
     low: float = 1.4,
     high: float = 2.0,
@@ -121,11 +127,12 @@ def hole_reaching(
     Source: Abdolmaleki et al. 2016, Section 4.2; the weights 1e5 and 10, and the length of a step, are those
     of its author's published settings.
     """
-    if not (width > 0.0 and depth > 0.0):
-        raise ValueError(f"the hole must have a width and a depth, got {width} and {depth}")
+    checks.number("width", width, above=0.0)
+    checks.number("depth", depth, above=0.0)
     default = gaussian_contexts(low, high, clip=True)
     sample_context = default if sample_context is None else sample_context
 
+    @checks.arguments
     def rollout(key: PRNGKey, context: Float[Array, "1"], theta: Float[Array, "18"]) -> HoleOutcome:
         del key
         movement = hole_movement(theta)
@@ -143,16 +150,19 @@ def hole_reaching(
     return Task(sample_context, rollout, context_dim=1, theta_dim=theta_dim, worst_reward=-1e8)
 
 
+@checks.arguments
 def via_point_movement(theta: Float[Array, "15"]) -> DmpTrajectory:
     """Return the joints' movement in `via_point_reaching`, rad and s."""
     return _movement(theta, jnp.array(_STRETCHED, theta.dtype))
 
 
+@checks.arguments
 def hole_movement(theta: Float[Array, "18"]) -> DmpTrajectory:
     """Return the joints' movement in `hole_reaching`, rad and s."""
     return _movement(theta[:-NUM_LINKS], theta[-NUM_LINKS:])
 
 
+@checks.arguments
 def arm_points(joint_pos: Float[Array, " k"]) -> Float[Array, "k+1 2"]:
     """Return the ends of the links of 1 m, from the base at the origin to the end effector.
 
@@ -167,6 +177,7 @@ def arm_points(joint_pos: Float[Array, " k"]) -> Float[Array, "k+1 2"]:
     return jnp.concatenate([jnp.zeros((1, 2), ends.dtype), ends])
 
 
+@checks.arguments
 def hits_ground(
     points: Float[Array, "n 2"], center: Scalar, width: ScalarLike, depth: ScalarLike
 ) -> Bool[Array, ""]:
@@ -197,8 +208,6 @@ def hits_ground(
 
 
 def _movement(weights: Array, goal: Array) -> DmpTrajectory:
-    if weights.size != NUM_BASIS * NUM_LINKS or goal.size != NUM_LINKS:
-        raise ValueError(f"theta has the wrong size: {weights.size} weights and {goal.size} goals")
     start = jnp.array(_START, goal.dtype)
     return dmp_trajectory(
         weights.reshape(NUM_BASIS, NUM_LINKS), start, goal, duration=DURATION, num_steps=NUM_STEPS

@@ -4,6 +4,7 @@ import math
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.tasks.base import PlainOutcome, Task
 from creps_jax.typing import Array, Float, PRNGKey
@@ -11,6 +12,7 @@ from creps_jax.typing import Array, Float, PRNGKey
 __all__ = ["sinus"]
 
 
+@checks.arguments
 def sinus(low: float = 0.0, high: float = 5 * math.pi) -> Task:
     """Ask for theta = sin(context), with reward -(theta - sin s)^2.
 
@@ -26,11 +28,12 @@ def sinus(low: float = 0.0, high: float = 5 * math.pi) -> Task:
         A task of one context, Gaussian over the range, and one parameter.
 
     Raises:
-        ValueError: If `low` is not below `high`.
+        ValueError: If `low` is not below `high`, or one of them is no number.
 
     Source: Abdolmaleki et al. 2016, Section 4.1 and Fig. 5 (the reward is printed without its minus).
     """
 
+    @checks.arguments
     def rollout(key: PRNGKey, context: Float[Array, " 1"], theta: Float[Array, " 1"]) -> PlainOutcome:
         del key  # The task has no noise.
         reward = -jnp.square(theta[0] - jnp.sin(context[0]))

@@ -11,7 +11,7 @@ import numpy as np
 from experiments import results
 from experiments.errors import UserError
 from experiments.session import plain, storage
-from experiments.session.settings import Settings, load_settings
+from experiments.session.settings import MAX_BATCH, Settings, load_settings
 from experiments.session.trials import Record, Trial
 
 if TYPE_CHECKING:
@@ -142,8 +142,8 @@ class RobotSession:
         """
         if context is not None:
             context = self.settings.checked_context(context)
-        if more is not None and more < 1:
-            raise UserError(f"more must be at least 1, got {more}")
+        if more is not None and not 1 <= more <= MAX_BATCH:
+            raise UserError(f"more must be from 1 to {MAX_BATCH}, got {more}")
         with storage.locked(self.folder, wait=LOCK_SECONDS):
             record = self._record()
             pending = record.pending()

@@ -12,6 +12,10 @@ from experiments.errors import UserError
 from experiments.session import plain
 
 CONSTRAINTS = ("sigmoid", "clip")
+MAX_BATCH = 10_000
+"""So many trials are drawn, and written down, at once."""
+MAX_ARCHIVE = 1_000_000
+"""So many trials an update can hold in memory."""
 MAX_CONTEXTS = 10
 """Policies are compared on a grid of contexts, which has 2^10 points then."""
 
@@ -209,11 +213,13 @@ def _check_numbers(settings: Settings) -> None:
         bound = getattr(settings, name)
         if bound is not None and not bound > 0:
             raise UserError(f"{name} must be above zero, got {bound:g}")
-    if settings.batch_size < 1:
-        raise UserError(f"batch_size must be at least 1, got {settings.batch_size}")
+    if not 1 <= settings.batch_size <= MAX_BATCH:
+        raise UserError(f"batch_size must be from 1 to {MAX_BATCH}, got {settings.batch_size}")
     if settings.archive_size is not None and settings.archive_size < settings.batch_size:
         raise UserError(
             f"archive_size must be at least batch_size, {settings.batch_size}, got {settings.archive_size}"
         )
+    if settings.archive_size is not None and settings.archive_size > MAX_ARCHIVE:
+        raise UserError(f"archive_size must be at most {MAX_ARCHIVE}, got {settings.archive_size}")
     if not 0 <= settings.seed < 2**32:
         raise UserError(f"seed must be from 0 to {2**32 - 1}, got {settings.seed}")

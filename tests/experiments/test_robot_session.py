@@ -103,7 +103,7 @@ def test_contexts_are_drawn_or_given(session):
         session.ask([2.5], more=1)
     with pytest.raises(UserError, match=r"a number for each of distance, got \(1, 2\)"):
         session.ask([1, 2], more=1)
-    with pytest.raises(UserError, match="more must be at least 1, got 0"):
+    with pytest.raises(UserError, match="more must be from 1 to 10000, got 0"):
         session.ask(more=0)
     drawn = {trial.context["distance"] for trial in session.ask(more=20)[3:]}
     assert len(drawn) == 20
@@ -415,7 +415,7 @@ def broken(*path, **values) -> dict:
         (broken("parameters", 0, spread=0.0), "spread of speed must be above zero, got 0"),
         (broken("parameters", 0, spread=1e-60), "diagonal of its cov_chol above zero"),
         (broken("features", kind="cubic"), "features must be one of linear, rbf, got 'cubic'"),
-        (broken("features", num_centers=0), "num_centers has to be a whole number >= 1, got 0"),
+        (broken("features", num_centers=0), "num_centers must be at least 1, got 0"),
         (broken("features", num_centers=2.5), r"features\.num_centers must be a whole number, got 2\.5"),
         (
             broken(features=3),
@@ -424,7 +424,7 @@ def broken(*path, **values) -> dict:
         (broken(constraint="penalty"), "constraint must be one of sigmoid, clip, got 'penalty'"),
         (broken(kl_bound=0), "kl_bound must be above zero, got 0"),
         (broken(mean_kl_bound=None), "must be numbers both, or null both, got None and 0.05"),
-        (broken(batch_size=0), "batch_size must be at least 1, got 0"),
+        (broken(batch_size=0), "batch_size must be from 1 to 10000, got 0"),
         (broken(batch_size=20), "archive_size must be at least batch_size, 20, got 12"),
         (broken(archive_size=4), "archive_size must be at least 5, features and parameters, got 4"),
         (broken(seed=-1), "seed must be from 0 to 4294967295, got -1"),

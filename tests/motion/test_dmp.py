@@ -1,7 +1,5 @@
 """Movement primitives: their known properties, and an integrator of the differential equation as oracle."""
 
-import inspect
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,15 +101,13 @@ def test_a_fit_agrees_with_the_package_movement_primitives():
 
 
 def test_shapes_that_do_not_fit_are_refused():
-    # The annotations of the tests would refuse it first.
-    unchecked = inspect.unwrap(dmp_trajectory)
-    with pytest.raises(ValueError, match=r"weights \(5, 2\), start \(3,\)"):
-        unchecked(WEIGHTS, jnp.zeros(3), GOAL, duration=1.0, num_steps=100)
+    with pytest.raises(ValueError, match=r"start must have shape \(2,\) beside weights \(5, 2\), got \(3,\)"):
+        dmp_trajectory(WEIGHTS, jnp.zeros(3), GOAL, duration=1.0, num_steps=100)
     with pytest.raises(ValueError, match="num_steps must be at least 1, got 0"):
         moved(num_steps=0)
-    with pytest.raises(ValueError, match=r"duration must be positive, got 0\.0"):
+    with pytest.raises(ValueError, match=r"duration must be finite and above 0, got 0\.0"):
         moved(duration=0.0)
-    with pytest.raises(ValueError, match=r"one row or more, got weights \(0, 2\)"):
+    with pytest.raises(ValueError, match=r"weights must have shape \(b, d\), got \(0, 2\)"):
         moved(jnp.zeros((0, 2)))
-    with pytest.raises(ValueError, match=r"got shape \(5, 2\) and 5 bases"):
+    with pytest.raises(ValueError, match="num_basis must be less than the 5 positions of pos, got 5"):
         fit_dmp(jnp.zeros((5, 2)), 5)

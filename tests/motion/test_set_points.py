@@ -68,11 +68,7 @@ def test_a_set_point_reaches_its_target_or_comes_as_near_as_it_can():
     assert 0 < is_near.sum() < NUM_JOINTS
 
 
-@pytest.mark.parametrize(
-    ("duration", "period"), [(1.0, 0.0), (0.01, 0.02), (float("inf"), 0.02), (float("nan"), 0.02)]
-)
+@pytest.mark.parametrize(("duration", "period"), [(1.0, 0.0), (0.01, 0.02)])
 def test_a_walk_without_length_is_refused(duration, period):
-    with pytest.raises(
-        ValueError, match=rf"0 < period <= duration, both finite, got {period} and {duration}"
-    ):
+    with pytest.raises(ValueError, match=rf"period must be .* at most duration, got {period} and {duration}"):
         open_loop_set_points(WalkParams(*WALKING), duration=duration, period=period)

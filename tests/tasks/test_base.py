@@ -93,7 +93,7 @@ def test_wrappers_stack(task, key):
         (lambda task: average_repeats(task, 0), "repeats must be at least 1, got 0"),
         (lambda task: sigmoid_constrained(task, (0.0,), (1.0,)), r"2 parameters, got shapes \(1,\)"),
         (lambda task: penalised(task, (0, 2), (1, 1), 1), r"must not exceed .* \[0\. 2\.\] and \[1\. 1\.\]"),
-        (lambda task: penalised(task, 0.0, 1.0, -3), "penalty must not be negative, got -3"),
+        (lambda task: penalised(task, 0.0, 1.0, -3), "penalty must be finite and at least 0, got -3"),
     ],
 )
 def test_refuses_what_does_not_fit(task, wrap, message):

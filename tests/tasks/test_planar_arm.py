@@ -136,7 +136,7 @@ def test_contexts_stay_in_their_range(task, low, high):
 
 
 def test_a_hole_without_size_is_refused():
-    with pytest.raises(ValueError, match=r"a width and a depth, got 0.0 and 1.0"):
+    with pytest.raises(ValueError, match=r"width must be finite and above 0, got 0.0"):
         hole_reaching(width=0.0)
     with pytest.raises(ValueError, match="low must be below high"):
         hole_reaching(2.0, 1.4, sample_context=lambda key: jnp.ones(1))

@@ -4,6 +4,7 @@ import math
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.linalg import thomas_solve
 from creps_jax.motion.walking.params import GRAVITY
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
@@ -11,6 +12,7 @@ from creps_jax.typing import Array, Float, Scalar, ScalarLike
 __all__ = ["com_trajectory", "spring_height", "zmp_of_com"]
 
 
+@checks.arguments
 def spring_height(
     phase: Float[Array, "*n"], rest_height: Scalar, amplitude: Scalar, duration: Scalar
 ) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
@@ -38,6 +40,7 @@ def _neighbour_weight(com_height, com_height_acc, duration):
     return -com_height / ((GRAVITY + com_height_acc) * period**2)
 
 
+@checks.arguments
 def com_trajectory(
     zmp: Float[Array, " n"],
     com_height: Float[Array, " n"],
@@ -52,7 +55,7 @@ def com_trajectory(
 
     Args:
         zmp: ZMP reference along one horizontal axis, m. Its two end values are not used.
-        com_height: CoM height above the floor, m.
+        com_height: CoM height above the floor, m; positive.
         com_height_acc: Vertical CoM acceleration, m/s^2; greater than -g everywhere.
         start: CoM position at the first node, m.
         end: CoM position at the last node, m.
@@ -62,21 +65,25 @@ def com_trajectory(
         CoM position at the nodes, m.
 
     Raises:
-        ValueError: If there are fewer than three nodes or the shapes differ.
+        ValueError: If there are fewer than three nodes or the shapes differ, or a number is out of its range.
 
     Source: Abdolmaleki et al. 2016, Eq. 1, 5-9, with the signs of Eq. 1.
     """
-    shapes = [zmp.shape, com_height.shape, com_height_acc.shape]
-    if len(set(shapes)) != 1 or zmp.shape[0] < 3:
-        raise ValueError(f"com_trajectory needs three vectors of the same length n >= 3, got shapes {shapes}")
+    if len(zmp) < 3:
+        raise ValueError(f"zmp must have three nodes or more, got {len(zmp)}")
+    checks.finite("com_height", com_height, above=0.0)
+    checks.finite("com_height_acc", com_height_acc, above=-GRAVITY)
+    checks.number("duration", duration, above=0.0)
     weight = _neighbour_weight(com_height, com_height_acc, duration)
     # First and last row say x(1) = start and x(n) = end.
     inner = jnp.ones_like(zmp).at[jnp.array([0, -1])].set(0.0)
     neighbour = weight * inner
     rhs = zmp.at[0].set(start).at[-1].set(end)
+    checks.finite("zmp", rhs)
     return thomas_solve(neighbour, 1.0 - 2.0 * neighbour, neighbour, rhs)
 
 
+@checks.arguments
 def zmp_of_com(
     com: Float[Array, " n"],
     com_height: Float[Array, " n"],

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from creps_jax import checks
 from creps_jax.curves import smooth_step
 from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_UPPER, LEFT, RIGHT
 from creps_jax.motion.nao_kinematics import leg_ik
@@ -81,6 +82,7 @@ class BodyPose(NamedTuple):
     turn: Scalar
 
 
+@checks.arguments
 def plan_step(params: WalkParams, stance: Stance, command: Float[Array, "3"]) -> tuple[StepPlan, Stance]:
     """Plan one step: footstep, ZMP reference, CoM trajectory.
 
@@ -106,6 +108,7 @@ def plan_step(params: WalkParams, stance: Stance, command: Float[Array, "3"]) ->
     return StepPlan(footstep, com, jnp.stack([start[2], end[2]])), after
 
 
+@checks.arguments
 def plan_walk(params: WalkParams, num_steps: int, command: Float[Array, "3"] | None = None) -> StepPlan:
     """Plan a walk from standstill.
 
@@ -129,6 +132,7 @@ def plan_walk(params: WalkParams, num_steps: int, command: Float[Array, "3"] | N
     return lax.scan(plan_next, standing(dtype), length=num_steps)[1]
 
 
+@checks.arguments
 def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
     """Pose hips and feet at one time of a step.
 
@@ -166,6 +170,7 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
     )
 
 
+@checks.arguments
 def stand_upright(pose: BodyPose, slope: Scalar) -> BodyPose:
     """Move the hips of a pose to where they stand above the feet as gravity has it.
 
@@ -187,6 +192,7 @@ def _above_floor(foot, height):
     return jnp.stack([x - back * jnp.cos(yaw), y - back * jnp.sin(yaw), height, yaw])
 
 
+@checks.arguments
 def pose_joints(
     params: WalkParams, pose: BodyPose, measured_rpy: Float[Array, "3"], *, balance: Balance = Balance()
 ) -> Float[Array, "22"]:
@@ -241,6 +247,7 @@ def _head_and_arms(left_foot_ahead):
     return jnp.stack([jnp.asarray(angle, left_foot_ahead.dtype) for angle in [0.0, 0.0, *left, *right]])
 
 
+@checks.arguments
 def joint_targets(
     params: WalkParams,
     plans: StepPlan,
@@ -264,6 +271,7 @@ def joint_targets(
     return pose_joints(params, pose_at(params, plans, time), measured_rpy, balance=balance)
 
 
+@checks.arguments
 def pose_at(params: WalkParams, plans: StepPlan, time: Scalar) -> BodyPose:
     """Return the body pose of a planned walk at a time (see `joint_targets`)."""
     num_steps = plans.yaw.shape[0]

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.motion.walking.params import WalkParams
 from creps_jax.typing import Array, Bool, Float, Scalar
 
@@ -82,6 +83,7 @@ def _limit(seen, swing_side, share):
     return mirror * jnp.clip(mirror * seen, low, high)
 
 
+@checks.arguments
 def next_footstep(params: WalkParams, stance: Stance, command: Float[Array, "3"]) -> tuple[Footstep, Stance]:
     """Plan the next step.
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float, Scalar
 
 __all__ = [
@@ -108,6 +109,7 @@ class WalkParams(NamedTuple):
     step_growth: Scalar
 
 
+@checks.arguments
 def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
     """Turn a parameter vector in the paper's order and units into settings that the engine can plan with.
 
@@ -120,6 +122,9 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
 
     Returns:
         The settings, in SI units.
+
+    Raises:
+        ValueError: If theta has not one entry for each parameter.
     """
     safe = jnp.clip(theta, jnp.asarray(_SAFE_LOW, theta.dtype), jnp.asarray(_SAFE_HIGH, theta.dtype))
     params = WalkParams(*safe)
@@ -132,6 +137,7 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
     )
 
 
+@checks.arguments
 def count_steps(duration: float) -> int:
     """Return how many steps at most a walk can have, with any parameters of `params_from_theta`.
 

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
 __all__ = ["Balance", "corrected_lean"]
@@ -27,6 +28,7 @@ class Balance(NamedTuple):
     placement_gain: ScalarLike = 0.0
 
 
+@checks.arguments
 def corrected_lean(
     intended: Float[Array, "2"], measured: Float[Array, "2"], roll_gain: Scalar, tilt_gain: Scalar
 ) -> Float[Array, "2"]:

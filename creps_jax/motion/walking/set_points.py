@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from creps_jax import checks
 from creps_jax.motion.nao_geometry import MAX_JOINT_SPEED
 from creps_jax.motion.walking.engine import joint_targets, plan_walk
 from creps_jax.motion.walking.params import WalkParams, count_steps
@@ -12,6 +13,7 @@ from creps_jax.typing import Array, Float
 __all__ = ["next_set_point", "open_loop_set_points"]
 
 
+@checks.arguments
 def next_set_point(
     set_point: Float[Array, "22"], target: Float[Array, "22"], period: float
 ) -> Float[Array, "22"]:
@@ -29,6 +31,7 @@ def next_set_point(
     return set_point + jnp.clip(target - set_point, -farthest, farthest)
 
 
+@checks.arguments
 def open_loop_set_points(params: WalkParams, *, duration: float, period: float) -> Float[Array, "n 22"]:
     """Plan the set-points of a walk for a robot that only plays them.
 
@@ -47,8 +50,8 @@ def open_loop_set_points(params: WalkParams, *, duration: float, period: float) 
     Raises:
         ValueError: If the walk is not as long as a period, or one of the two is not a positive number.
     """
-    if not 0.0 < period <= duration < float("inf"):
-        raise ValueError(f"expected 0 < period <= duration, both finite, got {period} and {duration} s")
+    if not 0.0 < period <= duration:
+        raise ValueError(f"period must be above 0 and at most duration, got {period} and {duration} s")
     plans = plan_walk(params, count_steps(duration))
     upright = jnp.stack([jnp.zeros_like(params.lean), params.lean, jnp.zeros_like(params.lean)])
     times = jnp.arange(round(duration / period) + 1, dtype=params.lean.dtype) * period

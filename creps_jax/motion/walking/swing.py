@@ -2,12 +2,14 @@
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.curves import bezier, smooth_step
 from creps_jax.typing import Array, Float, Scalar
 
 __all__ = ["swing_pose"]
 
 
+@checks.arguments
 def swing_pose(
     start: Float[Array, "3"], end: Float[Array, "3"], height: Scalar, phase: Scalar
 ) -> tuple[Float[Array, "3"], Scalar]:

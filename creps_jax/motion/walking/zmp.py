@@ -2,11 +2,13 @@
 
 import jax.numpy as jnp
 
+from creps_jax import checks
 from creps_jax.typing import Array, Float, Scalar
 
 __all__ = ["zmp_reference"]
 
 
+@checks.arguments
 def zmp_reference(
     phase: Float[Array, " n"],
     start: Float[Array, "2"],

@@ -1,0 +1,783 @@
+"""Call every public function with one bad argument, as users do: without the import hook of the other tests.
+
+The hook would name wrong types before the library does. `test_bad_input.py` therefore runs this file in a
+process of its own, without `conftest.py`. Nothing here compiles more than a few small operations.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import importlib
+import inspect
+import math
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import creps_jax as cj
+from creps_jax import rotations, tasks
+from creps_jax.archive import push
+from creps_jax.dual import DualSolution
+from creps_jax.motion import dmp, nao_geometry
+from creps_jax.motion.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
+from creps_jax.motion.walking.posture import Balance
+from creps_jax.mstep import WeightedSamples, weighted_ml
+from creps_jax.physics import c, mjx, servos, world
+from creps_jax.physics import state as physics_state
+from creps_jax.tasks import conditions, functions, planar_arm
+from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, load_nao, record_walk
+
+# What of an argument an error names, where it is a part of it.
+NAMES = {
+    "task": ("task", "rollout", "sample_context"),
+    "start": ("start", "policy"),
+    "state": ("state", "policy"),
+}
+LIBRARY = str(Path(cj.__file__).parent)
+EXPECTS = ("must", "has to", "have to", "needs", "needed", "takes")
+
+
+class Spoilt(NamedTuple):
+    """A bad value, and what of it an error has to show; None where the library may also bear it."""
+
+    value: Any
+    shown: str | None
+
+
+class Argument(NamedTuple):
+    """A good value, and what to put in its place."""
+
+    good: Any
+    spoilt: st.SearchStrategy[Spoilt]
+
+
+def one_of(*spoilt: tuple[Any, str | None]) -> st.SearchStrategy[Spoilt]:
+    return st.sampled_from([Spoilt(*pair) for pair in spoilt])
+
+
+NONSENSE = one_of((None, "None"), ("three", "'three'"), ({"a": 1}, "{'a': 1}"), ([1.0, "a"], "[1.0, 'a']"))
+NO_NUMBERS = NONSENSE | one_of(
+    (2 - 1j, "(2-1j)"), (jax.random.key(0), "key<fry>"), ([[1.0], [1.0, 2.0]], "[[")
+)
+
+
+def no_number(*, least: float = -math.inf, above: float = -math.inf) -> st.SearchStrategy[Spoilt]:
+    too_small = []
+    if max(least, above) > -math.inf:
+        bound = max(least, above)
+        too_small = [
+            st.floats(max_value=bound, exclude_max=least > above).map(lambda x: Spoilt(x, f"{x}")),
+            one_of((np.float32(bound - 1), f"{bound - 1}"), (jnp.float32(bound - 1), f"{bound - 1}")),
+        ]
+    not_finite = one_of((math.nan, "nan"), (math.inf, "inf"), (-math.inf, "-inf"), (1e300, "1e+300"))
+    return st.one_of(NO_NUMBERS, one_of((np.ones(2), "(2,)"), (True, "True")), not_finite, *too_small)
+
+
+def number(good: float, **bounds: float) -> Argument:
+    same = one_of((np.float32(good), None), (np.float64(good), None), (jnp.float32(good), None))
+    return Argument(good, no_number(**bounds) | same)
+
+
+def count(good: int, least: int = 1) -> Argument:
+    whole = st.integers(max_value=least - 1) | st.integers(min_value=2**31)
+    return Argument(
+        good,
+        st.one_of(
+            NO_NUMBERS,
+            (whole | st.floats()).map(lambda x: Spoilt(x, f"{x}")),
+            one_of((True, "True"), (np.int64(least - 1), f"{least - 1}"), (np.int64(good), None)),
+            one_of((np.float32(2.5), "2.5"), (jnp.ones(3), "(3,)")),
+        ),
+    )
+
+
+def key(good: jax.Array) -> Argument:
+    return Argument(
+        good,
+        NONSENSE
+        | one_of((0, "0"), (jnp.zeros(2), "float32(2,)"), ([1, 2], "[1, 2]"), (np.uint32(7), "7"))
+        | one_of((good[None], "key<fry>"), (jax.random.key_data(good)[..., :1], "uint32")),
+    )
+
+
+def function(good: Callable) -> Argument:
+    return Argument(good, NONSENSE | one_of((0, "0"), (jnp.zeros(2), "(2,)")))
+
+
+def array(
+    good: Any, *, free: tuple[int, ...] = (), least: float | None = None, bears: tuple = ()
+) -> Argument:
+    """Spoil an array: the sizes of the `free` axes may be larger, `bears` are entries that it may hold."""
+    good = np.asarray(good, np.float32)
+
+    def shapes(draw: st.DrawFn) -> Spoilt:
+        if good.ndim == 0:
+            return draw(one_of((np.ones(1), "(1,)"), (jnp.ones((2, 3)), "(2, 3)")))
+        axis = draw(st.integers(0, good.ndim - 1))
+        size = draw(st.sampled_from([0] if axis in free else [0, good.shape[axis] + 1]))
+        resized = np.resize(good, (*good.shape[:axis], size, *good.shape[axis + 1 :]))
+        value = draw(st.sampled_from([resized, good[None], good[..., None], good[0], np.float32(1)]))
+        return Spoilt(value if draw(st.booleans()) else jnp.asarray(value), str(value.shape))
+
+    def entries(draw: st.DrawFn) -> Spoilt:
+        bad = draw(
+            st.sampled_from([math.nan, math.inf, -math.inf, 1e30, *([] if least is None else [least - 1])])
+        )
+        value = good.copy()
+        value[draw(st.tuples(*(st.integers(0, size - 1) for size in good.shape)))] = bad
+        is_bearable = bad in bears or abs(bad) == 1e30 or (math.isnan(bad) and any(map(math.isnan, bears)))
+        return Spoilt(value if draw(st.booleans()) else jnp.asarray(value), None if is_bearable else f"{bad}")
+
+    types = one_of(
+        *((good.astype(dtype), None) for dtype in (float, np.float16, int, bool)),
+        (good.tolist(), None),
+        (good.astype(complex), "complex"),
+        (good.astype(str), str(good.shape)),
+        (np.full(good.shape, None), str(good.shape)),
+    )
+    return Argument(good, NO_NUMBERS | types | st.composite(shapes)() | st.composite(entries)())
+
+
+def vector(good: Any, *, bears: tuple = ()) -> Argument:
+    """Spoil a setting that is a number or a vector."""
+    length = np.size(good)
+    wrong = one_of(*((np.full(shape, 0.3), f"{shape}|0.3 0.3") for shape in ((0,), (length + 2,), (1, 1, 1))))
+    entries = [x for x in (math.nan, math.inf, -math.inf) if x not in bears]
+    not_finite = one_of(
+        *(((*np.ravel(good)[1:].tolist(), x), f"{x}") for x in entries), (1e300, "1e+300|inf")
+    )
+    same = one_of((np.asarray(good, float), None), (jnp.asarray(good, jnp.float32), None))
+    return Argument(good, NO_NUMBERS | wrong | not_finite | same)
+
+
+def record(good: Any, *others: tuple[Any, str | None], **fields: Argument) -> Argument:
+    """Spoil a record: something else, or one field of it."""
+    spoilt = [NONSENSE, one_of((0, "0"), (jnp.zeros(2), "(2,)"), *others)]
+    if isinstance(good, tuple):
+        spoilt.append(one_of((tuple(good), "(")))
+    for name, argument in fields.items():
+        replace = partial(_replace, good, name)
+        spoilt.append(argument.spoilt.map(lambda bad, replace=replace: Spoilt(replace(bad.value), bad.shown)))
+    return Argument(good, st.one_of(spoilt))
+
+
+def _replace(record: Any, name: str, value: Any) -> Any:
+    return (
+        record._replace(**{name: value})
+        if isinstance(record, tuple)
+        else dataclasses.replace(record, **{name: value})
+    )
+
+
+def optional(argument: Argument) -> Argument:
+    return Argument(
+        argument.good,
+        argument.spoilt.map(
+            lambda bad: bad._replace(shown=bad.shown and None if bad.value is None else bad.shown)
+        ),
+    )
+
+
+KEY = jax.random.key(0)
+N, S, D = 6, 1, 2
+CONTEXTS, THETAS, REWARDS = np.linspace(0, 1, N)[:, None], np.ones((N, D)), np.arange(N)
+FEATURES = cj.linear_features(S)
+ALGORITHM = cj.creps(FEATURES, FEATURES, archive_size=8)
+POLICY = cj.LinearGaussian(jnp.ones((FEATURES.size, D)), jnp.eye(D))
+STATE = ALGORITHM.init(POLICY)
+
+
+def rollout(key: Any, context: Any, theta: Any) -> tasks.PlainOutcome:
+    return tasks.PlainOutcome(-jnp.sum(theta**2), jnp.zeros(0))
+
+
+TASK = cj.Task(cj.uniform_contexts(0.0, 1.0), rollout, S, D, worst_reward=-10.0)
+# Learns nothing, and compiles at once.
+QUICK = dataclasses.replace(
+    ALGORITHM,
+    tell=lambda state, batch: (
+        state._replace(archive=push(state.archive, batch), iteration=state.iteration + 1),
+        (),
+    ),
+)
+
+
+def policy(good: cj.LinearGaussian = POLICY) -> Argument:
+    diagonal = [np.diag([1.0, x]) for x in (0.0, -1.0)]
+    return record(
+        good,
+        *((good._replace(cov_chol=x), str(x[1, 1])) for x in diagonal),
+        (good._replace(cov_chol=np.array([[1.0, 0.5], [0.5, 1.0]])), "0.5"),
+        coef=array(good.coef),
+        cov_chol=array(good.cov_chol),
+    )
+
+
+def state() -> Argument:
+    other = cj.creps(cj.linear_features(3), cj.linear_features(3), archive_size=9)
+    start = cj.LinearGaussian(jnp.ones((4, 3)), jnp.eye(3))
+    return record(STATE, (POLICY, "LinearGaussian"), (other.init(start), "3)"), policy=policy())
+
+
+def features(good: cj.FeatureMap = FEATURES) -> Argument:
+    return record(
+        good,
+        (cj.linear_features, "linear_features"),
+        (good._replace(apply=lambda context: context), "(1,)"),
+        (good._replace(apply=lambda context: 3.0), "()"),
+        apply=function(good.apply),
+        size=count(good.size),
+        context_dim=count(good.context_dim),
+        scale=optional(vector((1.0, 1.0))),
+    )
+
+
+def task() -> Argument:
+    def with_outcome(make: Callable) -> cj.Task:
+        return dataclasses.replace(TASK, rollout=lambda key, context, theta: make(theta))
+
+    outcomes = {
+        "float32": lambda theta: theta.sum(),
+        "None": lambda theta: None,
+        "'good'": lambda theta: tasks.PlainOutcome("good", jnp.zeros(0)),
+        "(2,)": lambda theta: tasks.PlainOutcome(theta, jnp.zeros(0)),
+        "{'reward'": lambda theta: {"reward": 0.0},
+        "complex64": lambda theta: tasks.PlainOutcome(1j * theta.sum(), jnp.zeros(0)),
+    }
+    bad_rollouts = [(with_outcome(make), shown) for shown, make in outcomes.items()]
+    samples = {"(3,)": jnp.zeros(3), "()": jnp.zeros(()), "None": None, "[0.5]": [0.5]}
+    bad_samplers = [
+        (dataclasses.replace(TASK, sample_context=lambda key, x=x: x), shown) for shown, x in samples.items()
+    ]
+    return record(TASK, *bad_rollouts, *bad_samplers, (cj.sinus, "sinus"))
+
+
+class Row(NamedTuple):
+    """A function by its good arguments, and what to do with its result to see that it is good."""
+
+    function: Callable
+    arguments: dict[str, Argument]
+    use: Callable = lambda result: result
+
+
+def row(function: Callable, /, use: Callable = lambda result: result, **arguments: Argument) -> Row:
+    return Row(function, arguments, use)
+
+
+def use_task(task: cj.Task) -> Any:
+    arguments = KEY, jnp.zeros(task.context_dim), jnp.zeros(task.theta_dim)
+    return task.sample_context(KEY), jax.eval_shape(task.rollout, *arguments), task.worst_reward
+
+
+def use_features(features: cj.FeatureMap) -> Any:
+    return features.apply(jnp.full(features.context_dim, 0.3))
+
+
+def use_sampler(sample_context: Callable) -> Any:
+    return sample_context(KEY)
+
+
+def use_run(result: tuple[cj.CrepsState, cj.IterationLog]) -> Any:
+    return result[0].policy, result[1].mean_reward
+
+
+SOLUTION = DualSolution(
+    jnp.float32(1.0), jnp.ones(S), jnp.float32(0.0), num_steps=jnp.int32(3), is_active=jnp.asarray(True)
+)
+WALK_POSES = {"side": Argument(1.0, no_number() | one_of((0, "0"), (jnp.float32(0.5), "0.5")))}
+ANY = (math.nan, math.inf, -math.inf)
+DEVICES = optional(Argument(jax.devices(), NONSENSE | one_of((2, "2"), ([], "[]"), (["cpu"], "['cpu']"))))
+FIT = {
+    "features": array(np.column_stack([np.ones(N), CONTEXTS]), free=(1,)),
+    "theta": array(THETAS * REWARDS[:, None], free=(1,)),
+    "weights": array(np.full(N, 1 / N), least=0.0),
+    "ridge": number(0.1, least=0.0),
+    "scale": optional(array(np.ones(2))),
+    "start": optional(array(np.zeros((2, D)))),
+}
+SAMPLES = {"reward": array(REWARDS, bears=ANY), "features": array(CONTEXTS, free=(1,), bears=ANY)}
+RUN = {
+    "key": key(KEY),
+    "task": task(),
+    "algorithm": record(QUICK, (cj.creps, "creps")),
+    "start": policy(),
+    "iterations": count(2),
+    "samples": count(3),
+    "first_samples": optional(count(3)),
+    "on_iteration": function(lambda state, log: None),
+    "devices": DEVICES,
+}
+
+MODEL = load_nao()
+WALK = params.params_from_theta(jnp.asarray(np.mean(params.NAO_BOUNDS, axis=0), jnp.float32))
+PLANS = jax.eval_shape(lambda: engine.plan_walk(WALK, 3))
+PLAN = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), PLANS)
+PLANS = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), PLANS)
+POSE = engine.BodyPose(jnp.zeros(4), jnp.zeros(4), jnp.zeros(4), jnp.zeros(()))
+VECTOR = array(np.ones(3), bears=ANY)
+MATRIX = array(np.eye(3), bears=ANY)
+SCALAR = array(np.float32(0.5), bears=ANY)
+JOINTS = array(np.zeros(nao_geometry.NUM_JOINTS), bears=ANY)
+BALANCE = record(Balance())
+FLAT = conditions.Circumstances(world.world_of(MODEL)).world
+
+
+def traced(function: Callable, /, use: Callable = lambda result: result, **arguments: Argument) -> Row:
+    """Make the row of a function whose results are not to be computed: only their shapes are seen."""
+    return Row(lambda **given: jax.eval_shape(lambda: use(function(**given))), arguments)
+
+
+def made(function: Callable, /, **arguments: Argument) -> Row:
+    """Make the row of a function whose result says nothing more than that it is there."""
+    return Row(function, arguments, lambda _: ())
+
+
+ROTATIONS = (rotations.rotation_x, rotations.rotation_y, rotations.rotation_z)
+OF_VECTORS = (
+    functions.ackley,
+    functions.ellipsoid,
+    functions.rastrigin,
+    functions.rosenbrock,
+    functions.sphere,
+)
+
+
+class Done(Exception):
+    """All settings have been checked."""
+
+
+def stop(model: Any, num_steps: int) -> None:
+    raise Done
+
+
+def before_physics(**given: Any) -> None:
+    """Record a walk, but for its physics and what comes after."""
+    with contextlib.suppress(Done):
+        record_walk(**given)
+
+
+MOTION = {
+    **{rotation.__name__: traced(rotation, angle=number(0.3)) for rotation in ROTATIONS},
+    "arm_points": traced(planar_arm.arm_points, use=lambda _: (), joint_pos=array(np.zeros(3), bears=ANY)),
+    "body_pose": traced(engine.body_pose, params=record(WALK), plan=record(PLAN), phase=SCALAR),
+    "corrected_lean": traced(
+        posture.corrected_lean,
+        intended=array(np.zeros(2), bears=ANY),
+        measured=array(np.zeros(2), bears=ANY),
+        roll_gain=SCALAR,
+        tilt_gain=SCALAR,
+    ),
+    "count_steps": made(params.count_steps, duration=number(8.0)),
+    "dmp_trajectory": traced(
+        dmp.dmp_trajectory,
+        weights=array(np.ones((3, 2)), free=(0,), bears=ANY),
+        start=array(np.ones(2), bears=ANY),
+        goal=array(np.ones(2), bears=ANY),
+        duration=number(1.0, above=0.0),
+        num_steps=count(5),
+    ),
+    "fit_dmp": traced(
+        dmp.fit_dmp, use=lambda _: (), pos=array(np.ones((9, 2)), bears=ANY), num_basis=count(3)
+    ),
+    "hits_ground": traced(
+        planar_arm.hits_ground,
+        points=array(np.ones((4, 2)), free=(0,), bears=ANY),
+        center=SCALAR,
+        width=number(0.3),
+        depth=number(1.0),
+    ),
+    "hole_movement": traced(planar_arm.hole_movement, theta=array(np.ones(18), bears=ANY)),
+    "joint_targets": traced(
+        engine.joint_targets,
+        params=record(WALK),
+        plans=record(PLANS),
+        time=SCALAR,
+        measured_rpy=VECTOR,
+        balance=BALANCE,
+    ),
+    "leg_indices": made(nao_geometry.leg_indices, **WALK_POSES),
+    "matrix_to_rpy": traced(rotations.matrix_to_rpy, rotation=MATRIX),
+    "next_footstep": traced(
+        footsteps.next_footstep, params=record(WALK), stance=record(footsteps.standing()), command=VECTOR
+    ),
+    "next_set_point": traced(set_points.next_set_point, set_point=JOINTS, target=JOINTS, period=number(0.02)),
+    "open_loop_set_points": traced(
+        set_points.open_loop_set_points,
+        params=record(WALK),
+        duration=number(1.0, above=0.0),
+        period=number(0.02, above=0.0),
+    ),
+    "params_from_theta": traced(params.params_from_theta, theta=array(np.ones(10), bears=ANY)),
+    "plan_step": traced(
+        engine.plan_step, params=record(WALK), stance=record(footsteps.standing()), command=VECTOR
+    ),
+    "plan_walk": traced(engine.plan_walk, params=record(WALK), num_steps=count(3), command=optional(VECTOR)),
+    "pose_at": traced(engine.pose_at, params=record(WALK), plans=record(PLANS), time=SCALAR),
+    "pose_joints": traced(
+        engine.pose_joints, params=record(WALK), pose=record(POSE), measured_rpy=VECTOR, balance=BALANCE
+    ),
+    "quat_to_matrix": traced(rotations.quat_to_matrix, quat=array(np.ones(4), bears=ANY)),
+    "quat_to_rpy": traced(rotations.quat_to_rpy, quat=array(np.ones(4), bears=ANY)),
+    "rigid_transform": traced(rotations.rigid_transform, rotation=MATRIX, position=VECTOR),
+    "rpy_to_matrix": traced(rotations.rpy_to_matrix, rpy=VECTOR),
+    "rpy_to_quat": traced(rotations.rpy_to_quat, rpy=VECTOR),
+    "safe_arctan2": traced(rotations.safe_arctan2, use=lambda _: (), y=VECTOR, x=VECTOR),
+    "spring_height": traced(
+        com.spring_height,
+        use=lambda _: (),
+        phase=VECTOR,
+        rest_height=SCALAR,
+        amplitude=SCALAR,
+        duration=SCALAR,
+    ),
+    "stand_upright": traced(engine.stand_upright, pose=record(POSE), slope=SCALAR),
+    "swing_pose": traced(swing.swing_pose, start=VECTOR, end=VECTOR, height=SCALAR, phase=SCALAR),
+    "via_point_movement": traced(planar_arm.via_point_movement, theta=array(np.ones(15), bears=ANY)),
+    "zmp_of_com": traced(
+        com.zmp_of_com,
+        com=array(np.zeros(5), bears=ANY),
+        com_height=array(np.full(5, 0.3), bears=ANY),
+        com_height_acc=array(np.zeros(5), bears=ANY),
+        duration=number(0.3),
+    ),
+    "zmp_reference": traced(
+        zmp.zmp_reference,
+        phase=array(np.linspace(0, 1, 5), free=(0,), bears=ANY),
+        start=array(np.zeros(2), bears=ANY),
+        support=array(np.zeros(2), bears=ANY),
+        end=array(np.zeros(2), bears=ANY),
+        double_support_share=SCALAR,
+    ),
+}
+
+PHYSICS = {
+    "check_conditions": made(
+        conditions.check_conditions,
+        conditions=Argument((conditions.slope(-5.0, 5.0),), NONSENSE | one_of((3, "3"), ((0.1,), "0.1"))),
+        duration=number(8.0),
+    ),
+    "circumstances_of": made(
+        conditions.circumstances_of,
+        conditions=Argument((conditions.slope(-5.0, 5.0),), one_of(((), "(1,)"))),
+        values=array(np.zeros(1), bears=ANY),
+        world=record(FLAT),
+    ),
+    "friction": made(conditions.friction, low=number(0.5, above=0.0), high=number(1.0)),
+    "initial_state": traced(
+        physics_state.initial_state, qpos=array(np.zeros(29), free=(0,), bears=ANY), num_velocities=count(28)
+    ),
+    "make_control_step of c": made(c.make_control_step, model=record(MODEL), num_substeps=count(4)),
+    "make_control_step of mjx": made(mjx.make_control_step, model=record(MODEL), num_substeps=count(4)),
+    "payload": made(conditions.payload, low=number(0.0, least=0.0), high=number(1.0)),
+    "push": made(conditions.push, low=number(-0.1), high=number(0.1), time=number(3.0, above=0.0)),
+    "read_servos": made(servos.read_servos, model=record(MODEL)),
+    "record_walk": made(
+        before_physics,
+        key=key(KEY),
+        theta=array(np.ones(10), bears=ANY),
+        duration=number(8.0, above=0.0),
+        noise=record(WalkNoise(), lean=number(0.01, least=0.0)),
+        balance=record(Balance(), heading_gain=number(0.0)),
+        conditions=Argument((), NONSENSE | one_of((3, "3"))),
+        model=optional(record(MODEL)),
+        physics=function(stop),
+    ),
+    "slope": made(conditions.slope, low=number(-5.0, above=-90.0), high=number(5.0)),
+    "slope_angle": traced(conditions.slope_angle, world=record(FLAT)),
+    "substep_shares": made(physics_state.substep_shares, num_substeps=count(4)),
+    "upward": traced(conditions.upward, world=record(FLAT)),
+    "weighted_ml": traced(
+        weighted_ml,
+        policy=record(POLICY),
+        samples=record(WeightedSamples(FIT["features"].good, FIT["theta"].good, FIT["weights"].good, None)),
+        ridge=number(0.1, least=0.0),
+        scale=optional(array(np.ones(2))),
+    ),
+    "world_of": made(world.world_of, model=record(MODEL)),
+    **{of.__name__: traced(of, use=lambda _: (), x=VECTOR) for of in OF_VECTORS},
+}
+
+ROWS = {
+    **MOTION,
+    **PHYSICS,
+    "Importance": row(
+        cj.Importance, use=lambda _: (), num_policies=count(3), least_effective=number(5.0, least=1.0)
+    ),
+    "Task": row(
+        cj.Task,
+        use=use_task,
+        sample_context=function(TASK.sample_context),
+        rollout=function(rollout),
+        context_dim=count(S),
+        theta_dim=count(D),
+        worst_reward=number(-10.0),
+    ),
+    "average_repeats": row(cj.average_repeats, use=use_task, task=record(TASK), repeats=count(3)),
+    "bounded_ml": row(
+        cj.bounded_ml,
+        use=lambda _: (),
+        mean_kl_bound=number(1.0, above=0.0),
+        cov_kl_bound=number(0.1, above=0.0),
+        entropy_loss_bound=optional(number(0.1, above=0.0)),
+    ),
+    "com_trajectory": row(
+        cj.com_trajectory,
+        zmp=array(np.linspace(0, 0.1, 5), bears=(math.nan, math.inf, -math.inf)),
+        com_height=array(np.full(5, 0.3)),
+        com_height_acc=array(np.zeros(5), least=-9.81),
+        start=number(0.0),
+        end=number(0.1),
+        duration=number(0.3, above=0.0),
+    ),
+    "context_grid": row(cj.context_grid, low=vector(0.0), high=vector(1.0), num=count(3, least=2)),
+    "creps": row(
+        cj.creps,
+        use=lambda algorithm: jax.eval_shape(
+            lambda: algorithm.tell(algorithm.init(POLICY), cj.Batch(CONTEXTS, THETAS, REWARDS))[0].policy
+        ),
+        policy_features=features(),
+        baseline_features=features(),
+        kl_bound=number(0.5, above=0.0),
+        archive_size=count(8),
+        ridge=number(1e-4, least=0.0),
+        m_step=function(weighted_ml),
+        importance=optional(record(cj.Importance(3, 2.0))),
+    ),
+    "creps.init": row(ALGORITHM.init, policy=policy()),
+    "creps.ask": row(ALGORITHM.ask, key=key(KEY), state=state(), contexts=array(CONTEXTS, free=(0,))),
+    "creps.mean": row(ALGORITHM.mean, policy=policy(), contexts=array(CONTEXTS, free=(0,))),
+    "creps.tell": row(
+        ALGORITHM.tell,
+        use=lambda told: (told[0].policy, told[1]),
+        state=state(),
+        batch=record(
+            cj.Batch(CONTEXTS, THETAS, REWARDS),
+            (cj.Batch(CONTEXTS[:4], THETAS, REWARDS), "(4, 1)"),
+            context=array(CONTEXTS, bears=ANY),
+            theta=array(THETAS, bears=ANY),
+            reward=array(REWARDS, free=(0,), bears=ANY),
+        ),
+    ),
+    "contextual_function": row(
+        tasks.contextual_function,
+        use=use_task,
+        function=function(lambda x: jnp.sum(x**2)),
+        transform=array(np.ones((D, S)), free=(0, 1)),
+        low=number(0.0),
+        high=number(1.0),
+    ),
+    "evaluate": row(
+        cj.evaluate,
+        key=key(KEY),
+        task=task(),
+        contexts=array(CONTEXTS, bears=ANY),
+        thetas=array(THETAS, bears=ANY),
+        repeats=count(2),
+        devices=DEVICES,
+    ),
+    "fit_weighted_ml": row(cj.fit_weighted_ml, **FIT),
+    "gaussian_contexts": row(
+        cj.gaussian_contexts,
+        use=use_sampler,
+        low=vector(0.0),
+        high=vector(1.0),
+        std=optional(vector(0.5)),
+    ),
+    "gaussian_contexts of two": row(
+        cj.gaussian_contexts,
+        use=use_sampler,
+        low=vector((0.0, 0.1)),
+        high=vector((1.0, 0.9)),
+        std=vector((0.5, 0.1)),
+    ),
+    "hole_reaching": row(
+        cj.hole_reaching,
+        use=use_task,
+        low=number(1.4),
+        high=number(2.0),
+        width=number(0.3, above=0.0),
+        depth=number(1.0, above=0.0),
+        sample_context=optional(function(TASK.sample_context)),
+    ),
+    "leg_fk": row(cj.leg_fk, joint_pos=array(np.zeros(6)), **WALK_POSES),
+    "leg_ik": row(cj.leg_ik, T_torso_sole=array(np.eye(4)), **WALK_POSES),
+    "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
+    "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),
+    "make_iteration": row(
+        cj.make_iteration,
+        use=lambda step: jax.eval_shape(step, KEY, STATE),
+        **{name: RUN[name] for name in ("task", "algorithm", "samples", "devices")},
+    ),
+    "make_iteration()": row(
+        cj.make_iteration(TASK, QUICK, samples=3),
+        use=lambda result: jax.tree.map(jnp.shape, result),
+        key=key(KEY),
+        state=state(),
+    ),
+    "nao_walk": row(
+        cj.nao_walk,
+        use=lambda task: (task.sample_context(KEY), task.worst_reward),
+        low=number(0.1),
+        high=number(0.6),
+        duration=number(8.0),
+        start_up=number(2.0, least=0.0),
+        reward=record(WalkReward(), speed=number(10.0)),
+        noise=record(WalkNoise(), lean=number(0.01, least=0.0)),
+        balance=record(Balance(), heading_gain=number(0.0)),
+        conditions=Argument((), NONSENSE | one_of((3, "3"))),
+        sample_context=optional(function(TASK.sample_context)),
+        model=optional(record(MODEL)),
+        physics=function(lambda model, num_steps: None),
+    ),
+    "penalised": row(
+        cj.penalised,
+        use=use_task,
+        task=record(TASK),
+        low=vector((-1.0, -1.0), bears=(-math.inf,)),
+        high=vector((1.0, 1.0), bears=(math.inf,)),
+        penalty=number(10.0, least=0.0),
+    ),
+    "quadratic_features": row(cj.quadratic_features, use=use_features, dim=count(2)),
+    "rbf_features": row(
+        cj.rbf_features,
+        use=use_features,
+        low=vector(0.0),
+        high=vector(1.0),
+        num_centers=count(3),
+        bandwidth=optional(vector(0.2)),
+    ),
+    "rbf_features.apply": row(cj.rbf_features(0.0, 1.0, 3).apply, context=array(np.ones(1))),
+    "sample_weights": row(
+        cj.sample_weights,
+        solution=record(
+            SOLUTION,
+            temperature=number(1.0, above=0.0),
+            baseline_coef=array(SOLUTION.baseline_coef),
+        ),
+        **SAMPLES,
+        valid=optional(array(np.ones(N), bears=(*ANY, -1))),
+    ),
+    "sigmoid_constrained": row(
+        cj.sigmoid_constrained,
+        use=use_task,
+        task=record(TASK),
+        low=vector((-1.0, -1.0)),
+        high=vector((1.0, 1.0)),
+    ),
+    "sigmoid_gate": row(
+        cj.sigmoid_gate,
+        # It takes any number of vectors.
+        use=lambda gated: (jnp.isfinite(gated).all(), gated[..., :0].sum()),
+        theta=array(np.zeros((3, 2)), bears=(math.inf, -math.inf)),
+        low=vector((0.0, -1.0)),
+        high=vector((1.0, 1.0)),
+    ),
+    "sinus": row(cj.sinus, use=use_task, low=number(0.0), high=number(3.0)),
+    "solve_dual": row(
+        lambda **given: jax.eval_shape(lambda: cj.solve_dual(**given)),
+        **SAMPLES,
+        valid=optional(array(np.ones(N), bears=(*ANY, -1))),
+        kl_bound=number(0.5, above=0.0),
+    ),
+    "thomas_solve": row(
+        cj.thomas_solve,
+        lower=array(np.ones(4), bears=(math.nan,)),
+        diag=array(np.full(4, 3.0)),
+        upper=array(np.ones(4)),
+        rhs=array(np.arange(4)),
+    ),
+    "train": row(cj.train, use=use_run, **RUN),
+    "train_trials": row(
+        cj.train_trials,
+        use=use_run,
+        keys=key(jax.random.split(KEY, 2)),
+        **{**{name: argument for name, argument in RUN.items() if name != "key"}, "task": record(TASK)},
+    ),
+    "uniform_contexts": row(cj.uniform_contexts, use=use_sampler, low=vector(0.0), high=vector(1.0)),
+    "uniform_contexts()": row(cj.uniform_contexts(0.0, 1.0), key=key(KEY)),
+    "via_point_reaching": row(
+        cj.via_point_reaching,
+        use=use_task,
+        low=vector((-1.5, -1.5)),
+        high=vector((-0.5, -0.5)),
+        sample_context=optional(function(cj.uniform_contexts((0.0, 0.0), (1.0, 1.0)))),
+    ),
+}
+CASES = [(name, argument) for name, row in ROWS.items() for argument in row.arguments]
+
+
+@functools.cache
+def good_call(name: str) -> tuple[dict[str, Any], Any]:
+    """Return the good arguments of a function, and what comes of them."""
+    function, arguments, use = ROWS[name]
+    good = {name: argument.good for name, argument in arguments.items()}
+    return good, use(function(**good))
+
+
+@pytest.mark.parametrize(("name", "argument"), CASES, ids=[f"{name}-{argument}" for name, argument in CASES])
+def test_bad_input_is_named_or_borne(name, argument):
+    function, arguments, use = ROWS[name]
+    good, expected = good_call(name)
+
+    @settings(
+        max_examples=5,
+        deadline=None,
+        derandomize=True,
+        database=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(arguments[argument].spoilt)
+    def check(spoilt):
+        try:
+            result = use(function(**{**good, argument: spoilt.value}))
+        except ValueError as error:
+            check_error(error, argument, spoilt)
+        else:
+            check_result(result, expected)
+
+    check()
+
+
+def check_error(error: ValueError, argument: str, spoilt: Spoilt) -> None:
+    traceback = error.__traceback__
+    while traceback.tb_next is not None:
+        traceback = traceback.tb_next
+    place = traceback.tb_frame.f_code.co_filename
+    assert place.startswith(LIBRARY), f"raised in {place}: {error!r}"
+    message = str(error)
+    assert "got" in message and any(word in message for word in EXPECTS), message
+    assert any(name in message for name in NAMES.get(argument, (argument,))), message
+    assert spoilt.shown is None or any(shown in message for shown in spoilt.shown.split("|")), message
+    assert "\n" not in message and len(message) < 300, message
+
+
+def check_result(result: Any, expected: Any) -> None:
+    assert jax.tree.structure(result) == jax.tree.structure(expected)
+    for leaf, good in zip(jax.tree.leaves(result), jax.tree.leaves(expected), strict=True):
+        assert jnp.shape(leaf) == jnp.shape(good)
+        if not isinstance(leaf, jax.ShapeDtypeStruct):
+            assert np.isfinite(np.asarray(leaf, float)).all(), leaf
+
+
+def test_every_public_function_has_a_row():
+    """Public is what the API page lists, and what `from creps_jax import *` brings."""
+    page = (Path(__file__).parents[1] / "docs/api.md").read_text()
+    names = re.findall(r"automodule:: (\S+)", page)
+    modules = [cj, tasks, *map(importlib.import_module, names)]
+    public = {
+        name for module in modules for name in module.__all__ if inspect.isfunction(getattr(module, name))
+    }
+    # What is said of a row, such as "of mjx", follows its name.
+    rows = {name.split()[0] for name in ROWS}
+    # They take no argument but for a type, or are called for each robot in each step, where checks cost time.
+    assert public - {"load_nao", "standing", "changed_fields"} <= rows
+    assert {"Importance", "Task"} <= rows and len(names) > 20
