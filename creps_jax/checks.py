@@ -64,7 +64,7 @@ def arguments(function: F) -> F:
     Raises:
         ValueError: By the function, if an argument is something else.
     """
-    signature, annotations = inspect.signature(function), inspect.get_annotations(function)
+    signature, annotations = inspect.signature(function), inspect.get_annotations(function, eval_str=True)
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:

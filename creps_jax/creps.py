@@ -271,7 +271,7 @@ def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> 
     policy = LinearGaussian(_float32(coef), _float32(cov_chol))
     for field, values in policy._asdict().items():
         checks.finite(f"{name}.{field}", values)
-    if not isinstance(cov_chol, Tracer):
+    if not isinstance(policy.cov_chol, Tracer):
         upper, diagonal = np.triu(policy.cov_chol, 1), np.diagonal(policy.cov_chol)
         if upper.any():
             entry = upper[upper != 0][0]

@@ -1,6 +1,6 @@
 """Roll out a batch of parameters for a task, shared out over devices, and see to failures."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
@@ -27,13 +27,10 @@ def device_tuple(devices: Devices) -> tuple[jax.Device, ...]:
     """
     if devices is None:
         return tuple(jax.local_devices())
-    if (
-        not isinstance(devices, Sequence)
-        or not devices
-        or not all(isinstance(x, jax.Device) for x in devices)
-    ):
+    given = tuple(devices) if isinstance(devices, Iterable) else ()
+    if not given or not all(isinstance(device, jax.Device) for device in given):
         raise ValueError(f"devices must be one device or more, as jax.devices() has them, got {devices!r}")
-    return tuple(devices)
+    return given
 
 
 @partial(jax.jit, static_argnums=(0, 1))

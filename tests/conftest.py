@@ -53,6 +53,15 @@ def few_compiled_programs():
     jax.clear_caches()
 
 
+@pytest.fixture(scope="module")
+def compiled_as_for_users():
+    """Compile a file's programs with all optimisations, where these matter."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.fixture
 def key() -> jax.Array:
     """Return the key that tests without a seed of their own start from."""

@@ -14,6 +14,8 @@ from tests.oracles import dual_scipy
 
 NUM = 200
 NUM_FEATURES = 5
+# The last digits decide how rewards far out of reach are solved.
+pytestmark = pytest.mark.usefixtures("compiled_as_for_users")
 
 
 TRACES = []

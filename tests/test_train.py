@@ -57,15 +57,8 @@ class CountedTask:
 
 
 TASK = CountedTask().task
-
-
-@pytest.fixture(autouse=True, scope="module")
-def compiled_as_for_users():
-    """Compile with all optimisations: those that fuse operations are what could change bits."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+# What fuses operations could change bits.
+pytestmark = pytest.mark.usefixtures("compiled_as_for_users")
 
 
 def run(key, *, task=TASK, algorithm=ALGORITHM, start=POLICY, iterations=ITERATIONS, **settings):

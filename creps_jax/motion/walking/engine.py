@@ -207,7 +207,11 @@ def pose_joints(
 
     Returns:
         Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad, within the joint limits.
+
+    Raises:
+        ValueError: If the measured orientation is not finite.
     """
+    checks.finite("measured_rpy", measured_rpy)
     intended = jnp.stack([jnp.zeros_like(params.lean), params.lean])
     roll, pitch = corrected_lean(intended, measured_rpy[:2], params.roll_gain, params.tilt_gain)
     R_level_trunk = rotation_y(pitch) @ rotation_x(roll)
