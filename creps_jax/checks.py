@@ -149,7 +149,9 @@ def vector(name: str, value: Any, *, largest: float = FLOAT32_MAX) -> np.ndarray
         values = np.asarray(None)
     if values.dtype.kind not in "iuf" or values.ndim > 1 or values.size == 0:
         raise ValueError(f"{name} must be a number or a vector of numbers, got {shown(value)}")
-    return finite(name, values.astype(float), largest=largest)
+    values = finite(name, values.astype(float), largest=largest)
+    finite(name, values[np.isfinite(values)])  # none that float32 would make infinite
+    return values
 
 
 def ends(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -107,6 +107,7 @@ def test_an_array_that_is_good_is_returned_itself():
             r"x must be a number or a vector of numbers, got \(1.0, None",
         ),
         (partial(checks.vector, "x", (1.0, np.inf)), "x must be finite, got inf"),
+        (partial(checks.vector, "x", (1.0, 1e300), largest=np.inf), r"x must be finite, got 1e\+300"),
         (partial(checks.array, "x", "one"), "x must be an array of real numbers, got 'one'"),
         (partial(checks.array, "x", np.ones(2, complex)), r"real numbers, got complex128\(2,\)"),
         (partial(checks.array, "x", np.ones((3, 1)), ("n", 2)), r"x must have shape \(n, 2\), got \(3, 1\)"),
