@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 import creps_jax as cj
 from creps_jax import tasks
 from creps_jax.archive import push
+from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.mstep import weighted_ml
 from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, load_nao
@@ -278,7 +279,10 @@ def use_run(result: tuple[cj.CrepsState, cj.IterationLog]) -> Any:
 
 
 SOLUTION = cj.solve_dual(jnp.asarray(REWARDS, jnp.float32), jnp.asarray(CONTEXTS, jnp.float32), kl_bound=0.5)
-WALK_POSES = {"side": Argument(1.0, no_number() | one_of((0, "0"), (jnp.float32(0.5), "0.5")))}
+WALK_POSES = {
+    "side": Argument(1.0, no_number() | one_of((0, "0"), (jnp.float32(0.5), "0.5"))),
+    "robot": record(NAO),
+}
 ANY = (math.nan, math.inf, -math.inf)
 DEVICES = optional(Argument(jax.devices(), NONSENSE | one_of((2, "2"), ([], "[]"), (["cpu"], "['cpu']"))))
 FIT = {
@@ -404,6 +408,9 @@ ROWS = {
     ),
     "leg_fk": row(cj.leg_fk, joint_pos=array(np.zeros(6)), **WALK_POSES),
     "leg_ik": row(cj.leg_ik, T_torso_sole=array(np.eye(4)), **WALK_POSES),
+    "leg_ik of a shared motor": row(
+        partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))
+    ),
     "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
     "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),
     "make_iteration": row(
@@ -428,7 +435,8 @@ ROWS = {
         noise=record(WalkNoise(), lean=number(0.01, least=0.0)),
         balance=record(Balance(), heading_gain=number(0.0)),
         sample_context=optional(function(TASK.sample_context)),
-        model=optional(record(load_nao())),
+        robot=record(NAO, (NAO_H25, "range of the robot nao_h25")),
+        model=optional(record(load_nao(), (load_nao(NAO_H25), "-2.086 to 2.086"))),
         physics=function(lambda model, num_steps: None),
     ),
     "penalised": row(
