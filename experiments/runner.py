@@ -21,6 +21,9 @@ Say = Callable[[str], None]
 _MOST = {"iterations": 1_000_000, "trials": 1_000}
 """What a run can hold in memory, by setting."""
 
+_PAPERS_ROBOT = "nao"
+"""Whose walks are held against the paper's."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Request:
@@ -89,7 +92,8 @@ def run(request: Request, *, console: Console | None, say: Say) -> Path:
         update("failed")
         raise
     update("finished")
-    _save_claims(experiment, arrays, folder)
+    if results.robot_of(manifest) == _PAPERS_ROBOT:
+        _save_claims(experiment, arrays, folder)
     say(f"finished in {manifest['seconds']:.0f} s: {folder}")
     return folder
 
@@ -131,7 +135,7 @@ def check(names: tuple[str, ...], *, say: Say) -> bool:
     all_hold = True
     for name in names or tuple(registry.DESCRIPTIONS):
         registry.check_name(name)
-        folder = results.latest_folder(name, status="finished")
+        folder = results.latest_folder(name, status="finished", robot=_PAPERS_ROBOT)
         if folder is None:
             say(f"{name}: no results yet (python -m experiments run {name})\n")
             continue
@@ -226,6 +230,9 @@ def _override(settings: Any, request: Request) -> Any:
 def _identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
     """Return what has to agree for a checkpoint to belong to a run: all but how long it goes on."""
     same = {key: value for key, value in dataclasses.asdict(settings).items() if key != "iterations"}
+    # Checkpoints from before there was a choice of robots do not name one.
+    if same.get("robot") == _PAPERS_ROBOT:
+        del same["robot"]
     return {"experiment": name, "seed": seed, "settings": same}
 
 

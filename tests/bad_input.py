@@ -28,6 +28,7 @@ from creps_jax import rotations, tasks
 from creps_jax.archive import push
 from creps_jax.dual import DualSolution
 from creps_jax.motion import dmp, nao_geometry
+from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.motion.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.mstep import WeightedSamples, weighted_ml
@@ -293,7 +294,10 @@ def use_run(result: tuple[cj.CrepsState, cj.IterationLog]) -> Any:
 SOLUTION = DualSolution(
     jnp.float32(1.0), jnp.ones(S), jnp.float32(0.0), num_steps=jnp.int32(3), is_active=jnp.asarray(True)
 )
-WALK_POSES = {"side": Argument(1.0, no_number() | one_of((0, "0"), (jnp.float32(0.5), "0.5")))}
+WALK_POSES = {
+    "side": Argument(1.0, no_number() | one_of((0, "0"), (jnp.float32(0.5), "0.5"))),
+    "robot": record(NAO),
+}
 ANY = (math.nan, math.inf, -math.inf)
 DEVICES = optional(Argument(jax.devices(), NONSENSE | one_of((2, "2"), ([], "[]"), (["cpu"], "['cpu']"))))
 FIT = {
@@ -610,6 +614,9 @@ ROWS = {
     ),
     "leg_fk": row(cj.leg_fk, joint_pos=array(np.zeros(6)), **WALK_POSES),
     "leg_ik": row(cj.leg_ik, T_torso_sole=array(np.eye(4)), **WALK_POSES),
+    "leg_ik of a shared motor": row(
+        partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))
+    ),
     "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
     "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),
     "make_iteration": row(
@@ -635,7 +642,8 @@ ROWS = {
         balance=record(Balance(), heading_gain=number(0.0)),
         conditions=Argument((), NONSENSE | one_of((3, "3"))),
         sample_context=optional(function(TASK.sample_context)),
-        model=optional(record(MODEL)),
+        robot=record(NAO, (NAO_H25, "range of the robot nao_h25")),
+        model=optional(record(MODEL, (load_nao(NAO_H25), "-2.086 to 2.086"))),
         physics=function(lambda model, num_steps: None),
     ),
     "penalised": row(
