@@ -27,7 +27,7 @@ import creps_jax as cj
 from creps_jax import rotations, tasks
 from creps_jax.archive import push
 from creps_jax.dual import DualSolution
-from creps_jax.motion import dmp, nao_geometry
+from creps_jax.motion import dmp, nao_geometry, nao_kinematics
 from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.motion.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
 from creps_jax.motion.walking.posture import Balance
@@ -614,6 +614,7 @@ ROWS = {
     ),
     "leg_fk": row(cj.leg_fk, joint_pos=array(np.zeros(6)), **WALK_POSES),
     "leg_ik": row(cj.leg_ik, T_torso_sole=array(np.eye(4)), **WALK_POSES),
+    "leg_reach": row(nao_kinematics.leg_reach, robot=record(NAO)),
     "leg_ik of a shared motor": row(
         partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))
     ),
@@ -787,5 +788,5 @@ def test_every_public_function_has_a_row():
     # What is said of a row, such as "of mjx", follows its name.
     rows = {name.split()[0] for name in ROWS}
     # They take no argument but for a type, or are called for each robot in each step, where checks cost time.
-    assert public - {"load_nao", "standing", "changed_fields"} <= rows
+    assert public - {"load_nao", "model_path", "standing", "changed_fields"} <= rows
     assert {"Importance", "Task"} <= rows and len(names) > 20

@@ -48,10 +48,14 @@ def _links(robot: Robot) -> _Links:
     return _Links(hypot(forward, down), robot.geometry.shank_down, atan2(forward, down))
 
 
+@checks.arguments
 def leg_reach(robot: Robot = NAO) -> tuple[float, float]:
     """Return the least and the largest distance (m) of a robot's hip and ankle pitch axis.
 
     They are those with the knee at its lower limit, fully bent, and at its upper limit, stretched.
+
+    Raises:
+        ValueError: If `robot` is no robot.
     """
     knee = leg_indices(LEFT).start + 3
     links = _links(robot)
@@ -83,7 +87,7 @@ def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike, *, robot: Robot = NAO
     """
     checks.finite("joint_pos", joint_pos)
     side = _checked_side(side, joint_pos.dtype)
-    g = _geometry(robot)
+    g = robot.geometry
     yaw_pitch, hip_roll, hip_pitch, knee, ankle_pitch, ankle_roll = joint_pos
     tilt = side * _HIP_TILT
     R_torso_thigh = (
@@ -139,7 +143,7 @@ def leg_ik(
     """
     checks.finite("T_torso_sole", T_torso_sole)
     side = _checked_side(side, T_torso_sole.dtype)
-    g, links, reach = _geometry(robot), _links(robot), leg_reach(robot)
+    g, links, reach = robot.geometry, _links(robot), leg_reach(robot)
     if yaw_pitch is not None:
         if g.ankle_drop != 0.0:
             raise ValueError(f"yaw_pitch must be None for a robot of ankle_drop above 0, got {yaw_pitch!r}")
@@ -218,11 +222,6 @@ def _checked_side(side: ScalarLike, dtype: jnp.dtype) -> Array:
     if not isinstance(side, Tracer) and side not in (LEFT, RIGHT):
         raise ValueError(f"side must be LEFT ({LEFT}) or RIGHT ({RIGHT}), got {side!r}")
     return jnp.asarray(side, dtype)
-
-
-def _geometry(robot: Robot) -> NaoGeometry:
-    checks.instance("robot", robot, Robot)
-    return robot.geometry
 
 
 def _hip_position(side: Scalar, geometry: NaoGeometry) -> Float[Array, "3"]:

@@ -35,7 +35,16 @@ from creps_jax.tasks.conditions import (
 )
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
 
-__all__ = ["WalkNoise", "WalkOutcome", "WalkRecord", "WalkReward", "load_nao", "nao_walk", "record_walk"]
+__all__ = [
+    "WalkNoise",
+    "WalkOutcome",
+    "WalkRecord",
+    "WalkReward",
+    "load_nao",
+    "model_path",
+    "nao_walk",
+    "record_walk",
+]
 
 CONTROL_PERIOD = 0.02
 # Share of the torso's height with straight legs; with the knees bent most it still has .8 of it. Upright
@@ -138,20 +147,29 @@ def load_nao(robot: Robot = NAO) -> mujoco.MjModel:
     constraint rows: the set-points keep within the limits, and the servos hold the joints near them.
 
     Args:
-        robot: The simulated NAO, or `robots.NAO_H25`, the real one.
+        robot: The simulated NAO, or `creps_jax.motion.robots.NAO_H25`, the real one.
 
     Raises:
         FileNotFoundError: If the model file is in neither place.
+    """
+    spec = mujoco.MjSpec.from_file(str(model_path(robot)))
+    spec.compiler.discardvisual = True
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+    return spec.compile()
+
+
+def model_path(robot: Robot) -> Path:
+    """Return the file of a robot's model, in the checkout or in the installed package.
+
+    Raises:
+        FileNotFoundError: If it is in neither place.
     """
     package = Path(__file__).resolve().parents[1]
     folders = (package.parent / "models", package / "models")
     for folder in folders:
         path = folder / robot.name / f"{robot.name}.xml"
         if path.is_file():
-            spec = mujoco.MjSpec.from_file(str(path))
-            spec.compiler.discardvisual = True
-            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
-            return spec.compile()
+            return path
     raise FileNotFoundError(f"{robot.name}/{robot.name}.xml is in none of {', '.join(map(str, folders))}")
 
 
@@ -177,14 +195,17 @@ def nao_walk(
     speed is the displacement of the torso, in the frame of the start, over the time from the end of the
     start-up to the end of the episode. A fall ends the episode, and the speed up to it counts.
 
-    The robot may be any humanoid whose legs `leg_ik` can drive, with the joints of the NAO: `robots.NAO` and
-    `robots.NAO_H25` come with their models, another one is a `Robot` of its own and a model that fits it.
+    The robot may be any humanoid whose legs `leg_ik` can drive, with the joints of the NAO. Those of
+    `creps_jax.motion.robots`, `NAO` and `NAO_H25`, come with their models, another one is a `Robot` of its
+    own and a model that fits it.
 
     With further conditions, such as the slope of the floor, the context is the speed and the value of each.
 
     Args:
-        low: Lowest speed that is asked for, m/s.
-        high: Highest speed that is asked for, m/s.
+        low: Lowest speed that is asked for, m/s. The default range is that of `NAO`, for any robot; that of
+            another one is the caller's to choose, for `NAO_H25` about .05 to .3, as is the box of theta,
+            for `NAO_H25` `creps_jax.motion.walking.params.NAO_H25_BOUNDS`.
+        high: Highest speed that is asked for, m/s; see `low`.
         sample_context: (key) -> context (1 + k,); by default Gaussian about the middle, clipped to the range.
         duration: Length of the episode, s.
         start_up: Length of the time at its start over which the speed does not count, s.
@@ -203,7 +224,7 @@ def nao_walk(
     Raises:
         ValueError: If the range or the times are not in order, there are two conditions of one name or one
             that begins after the end, or the model is not that of the robot: driven by other joints, in other
-            limits, or with other legs.
+            limits or with other torques, or with other legs.
 
     Source: Abdolmaleki et al. 2016, Section 4.3.
     """

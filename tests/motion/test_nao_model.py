@@ -300,6 +300,36 @@ def test_a_model_that_does_not_fit_its_robot_is_an_error():
 
 
 @pytest.mark.parametrize(
+    ("largest", "is_limited", "found"),
+    [(4, True, "-5 to 4"), (6, True, "-5 to 6"), (5, False, "-inf")],
+)
+def test_a_model_with_other_motors_is_an_error(largest, is_limited, found):
+    model = load(NAO_H25)
+    knee = JOINT_NAMES.index("left_knee")
+    model.actuator_forcerange[knee], model.actuator_forcelimited[knee] = (-5.0, largest), is_limited
+    with pytest.raises(ValueError, match=f"left_knee must .*the robot nao_h25, -5 to 5 N m, got {found}"):
+        check_fit(model, NAO_H25)
+
+
+def test_a_model_with_another_number_of_yaw_motors_is_an_error():
+    model = load(NAO_H25)
+    two_motors = dataclasses.replace(NAO_H25, has_one_yaw_motor=False)
+    with pytest.raises(ValueError, match=r"must not hold .* of the robot nao_h25 is False, got one such"):
+        check_fit(model, two_motors)
+    model.eq_active0[:] = 0
+    check_fit(model, two_motors)
+    with pytest.raises(ValueError, match=r"must hold .* of the robot nao_h25 is True, got no such"):
+        check_fit(model, NAO_H25)
+
+
+def test_a_model_with_thicker_feet_is_an_error():
+    model = load(NAO)
+    model.geom_size[[model.geom(f"right_{corner}").id for corner in SOLE_CORNERS], 0] += 0.005
+    with pytest.raises(ValueError, match=r"right sole must be .* the robot nao has it, 0\.045 m, got 0\.05"):
+        check_fit(model, NAO)
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"joint_lower": (0.0,)}, "joint_lower must have 22 entries, got 1"),

@@ -9,7 +9,7 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.curves import smooth_step
-from creps_jax.motion.nao_geometry import LEFT, RIGHT
+from creps_jax.motion.nao_geometry import LEFT, RIGHT, leg_indices
 from creps_jax.motion.nao_kinematics import leg_ik
 from creps_jax.motion.robots import NAO, Robot
 from creps_jax.motion.walking.com import com_trajectory, spring_height
@@ -243,7 +243,10 @@ def _pose_legs(T_torso_left, T_torso_right, robot):
     left, right = leg_ik(T_torso_left, LEFT, robot=robot), leg_ik(T_torso_right, RIGHT, robot=robot)
     if not robot.has_one_yaw_motor:
         return left, right
-    shared = 0.5 * (left[0] + right[0])
+    yaws = [leg_indices(side).start for side in (LEFT, RIGHT)]
+    low, high = max(robot.joint_lower[i] for i in yaws), min(robot.joint_upper[i] for i in yaws)
+    # Within what the joint can do: clipped after `leg_ik`, it would take the soles from their places.
+    shared = jnp.clip(0.5 * (left[0] + right[0]), low, high)
     return (
         leg_ik(T_torso_left, LEFT, robot=robot, yaw_pitch=shared),
         leg_ik(T_torso_right, RIGHT, robot=robot, yaw_pitch=shared),
