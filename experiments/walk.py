@@ -41,9 +41,13 @@ NUM_SPEEDS = 11
 TIMESTEP = 0.004
 
 
-def _fastest(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
+def _fastest_name() -> str:
     """Choose what steps the robot: C MuJoCo on a CPU, where it starts sooner and is faster, elsewhere MJX."""
-    return (c if jax.default_backend() == "cpu" else mjx).make_control_step(model, num_substeps)
+    return "c" if jax.default_backend() == "cpu" else "mjx"
+
+
+def _fastest(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
+    return PHYSICS[_fastest_name()](model, num_substeps)
 
 
 PHYSICS = {"auto": _fastest, "mjx": mjx.make_control_step, "c": c.make_control_step}
@@ -126,6 +130,15 @@ class Settings:
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise UserError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+
+    def resolved(self) -> "Settings":
+        """Return the settings with what None and "auto" stand for here and today, for a run to keep."""
+        walker = self.walker()
+        own = {"low": walker.low, "high": walker.high, "bounds": self.robot}
+        chosen: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name) is None}
+        if self.physics == "auto":
+            chosen["physics"] = _fastest_name()
+        return dataclasses.replace(self, **chosen)
 
     def walker(self) -> Walker:
         """Return who learns to walk."""

@@ -13,7 +13,7 @@ from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c
 from creps_jax.tasks.conditions import slope
-from creps_jax.tasks.nao_walk import CONTROL_PERIOD, record_walk
+from creps_jax.tasks.nao_walk import CONTROL_PERIOD, model_path, record_walk
 from experiments import results
 from experiments.errors import UserError
 from experiments.policy_file import SavedPolicy, load_policy, policies_folder
@@ -142,11 +142,11 @@ def record(
     return clips
 
 
-def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None], *, robot: Robot = NAO) -> None:
+def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None], *, robot: Robot) -> None:
     """Write a video, or say why there is none: it is the one part of a result that a machine may lack."""
     try:
         middle = len(clips[0].qpos) * clips[0].period / 2
-        write_video(path, results.ROOT / "models" / robot.name / f"{robot.name}.xml", clips, still_at=middle)
+        write_video(path, model_path(robot), clips, still_at=middle)
         say(f"video: {path}")
     except VideoError as error:
         say(str(error))
@@ -192,7 +192,7 @@ def load_walking_policy(path: Path, robot: str | None = None) -> SavedPolicy:
         robot: whose policy it has to be; None is anyone's.
 
     Raises:
-        UserError: if it is not, or is unreadable.
+        UserError: if it is not, or is unreadable, or of an unknown robot.
     """
     policy = load_policy(path)
     if policy.param_names != PARAM_NAMES:
@@ -206,7 +206,10 @@ def load_walking_policy(path: Path, robot: str | None = None) -> SavedPolicy:
         raise UserError(
             f"{path} does not say how its steps were balanced: expected {wanted}, got {policy.task}"
         )
-    found = robot_of(policy).name
+    try:
+        found = robot_of(policy).name
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
     if robot is not None and find_walker(robot).robot.name != found:
         raise UserError(f"{path} is a policy of the robot {found}, not of {robot}")
     return policy

@@ -2,9 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from experiments.errors import UserError
 from experiments.process import import_mjx_quietly
+
+if TYPE_CHECKING:
+    from experiments.policy_file import SavedPolicy
 
 _OF_POLICY = {".onnx": "ONNX model", ".h": "C header"}
 _OF_WALK = {".csv": "CSV table", ".npz": "NumPy arrays"}
@@ -49,9 +53,7 @@ def export(
         from experiments.export import c_header, onnx_model
         from experiments.policy_file import load_policy
 
-        saved = load_policy(path)
-        if robot is not None:
-            _check_robot(path, robot)
+        saved = load_policy(path) if robot is None else _load_walking_policy(path, robot)
         {".onnx": onnx_model.save, ".h": c_header.save}[ending](to, saved)
     say(f"policy: {path}")
     say(f"{(_OF_POLICY | _OF_WALK)[ending]}: {to}")
@@ -86,8 +88,8 @@ def _default_policy(robot: str | None) -> Path:
     return default_policy(robot)
 
 
-def _check_robot(path: Path, robot: str) -> None:
+def _load_walking_policy(path: Path, robot: str) -> "SavedPolicy":
     import_mjx_quietly()
     from experiments.walking_policy import load_walking_policy
 
-    load_walking_policy(path, robot)
+    return load_walking_policy(path, robot)

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import shutil
 from pathlib import Path
 
 import jax
@@ -12,7 +13,7 @@ import pytest
 from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.motion.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS, PAPER_BOUNDS, PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
-from creps_jax.physics import c, mjx
+from creps_jax.physics import c
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.nao_walk import WalkOutcome, nao_walk
 from creps_jax.train import evaluate
@@ -201,7 +202,7 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
     )
     assert robot_of(load_walking_policy(tmp_path / "old.npz", "nao")) is NAO
     walk.save_policy(tmp_path / "odd.npz", dataclasses.replace(saved, task={**saved.task, "robot": "pepper"}))
-    with pytest.raises(UserError, match="unknown robot 'pepper', choose from: nao, nao_h25"):
+    with pytest.raises(UserError, match=r"odd\.npz: unknown robot 'pepper', choose from: nao, nao_h25"):
         load_walking_policy(tmp_path / "odd.npz")
 
 
@@ -225,7 +226,9 @@ def test_each_robot_has_its_latest_run(bench):
     folder = runner.run(request, console=None, say=lambda _: None)
     assert walking_policy.default_policy("nao_h25") == folder / "policy.npz"
     assert walking_policy.default_policy() == walking_policy.default_policy("nao") == SHIPPED
-    assert results.load_manifest(folder)["settings"]["robot"] == "nao_h25"
+    kept = results.load_manifest(folder)["settings"]
+    assert (kept["robot"], kept["low"], kept["high"], kept["bounds"]) == ("nao_h25", 0.05, 0.3, "nao_h25")
+    assert kept["physics"] == ("c" if jax.default_backend() == "cpu" else "mjx")
     # The paper says nothing about it.
     assert not (folder / "claims.md").exists() and "paper" not in (folder / "table.md").read_text()
     said = []
@@ -257,11 +260,60 @@ def test_physics_is_what_is_asked_for(monkeypatch, name):
     assert asked["physics"] is walk.PHYSICS[name]
 
 
-@pytest.mark.parametrize(("platform", "module"), [("cpu", c), ("gpu", mjx)])
-def test_the_faster_physics_of_the_machine_are_chosen(monkeypatch, platform, module):
+@pytest.mark.parametrize(("platform", "name"), [("cpu", "c"), ("gpu", "mjx")])
+def test_the_faster_physics_of_the_machine_are_chosen(monkeypatch, platform, name):
     monkeypatch.setattr(jax, "default_backend", lambda: platform)
-    monkeypatch.setattr(module, "make_control_step", lambda model, num_substeps: (model, num_substeps))
+    monkeypatch.setitem(walk.PHYSICS, name, lambda model, num_substeps: (model, num_substeps))
     assert walk.PHYSICS["auto"]("model", 5) == ("model", 5)
+    assert walk.Settings().resolved().physics == name
+
+
+def test_what_is_chosen_where_a_run_starts_is_what_is_meant_there():
+    for settings in (walk.SETTINGS["best"], walk.SETTINGS["paper"], walk.Settings(robot="nao_h25", high=0.2)):
+        resolved = settings.resolved()
+        assert (resolved.context_range(), resolved.box()) == (settings.context_range(), settings.box())
+        assert None not in (resolved.low, resolved.high, resolved.bounds)
+    assert walk.SETTINGS["paper"].resolved().bounds == "paper"
+    asked = walk.Settings(low=0.2, bounds="paper", physics="mjx").resolved()
+    assert (asked.low, asked.high, asked.bounds, asked.physics) == (0.2, 0.6, "paper", "mjx")
+
+
+def unfinished(name, settings):
+    """Leave a folder as an interrupted run does, and return it."""
+    folder = Path("results/walk") / name
+    manifest = results.make_manifest("walk", "quick", walk.SETTINGS["quick"], 0)
+    manifest |= {"settings": settings, "status": "interrupted", "started": name}
+    results.save_json(folder / results.MANIFEST, manifest)
+    return folder
+
+
+def test_resume_finds_the_latest_unfinished_run_of_the_robot(bench):
+    settings = {
+        robot: dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"], robot=robot).resolved())
+        for robot in WALKERS
+    }
+    others = unfinished("1", settings["nao_h25"])
+    ours = unfinished("2", settings["nao"])
+    for robot, folder in ((None, ours), ("nao", ours), ("nao_h25", others)):
+        overrides = {} if robot is None else {"robot": robot}
+        request = runner.Request("walk", overrides=overrides, resume=True)
+        resumed, found, _ = runner._resumed(walk, request)
+        assert found == folder and resumed.robot == (robot or "nao")
+    shutil.rmtree(others)
+    with pytest.raises(UserError, match="no unfinished run of walk with the robot nao_h25 in results"):
+        runner._resumed(walk, runner.Request("walk", overrides={"robot": "nao_h25"}, resume=True))
+
+
+@pytest.mark.parametrize("physics", ["mjx", "auto"])
+def test_a_run_from_before_robots_can_be_resumed(bench, physics):
+    """Its checkpoint has the settings of its manifest, without a robot: they have to be the same still."""
+    settings = dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"].resolved(), physics=physics))
+    del settings["robot"]
+    unfinished("1", settings)
+    resumed, _, manifest = runner._resumed(walk, runner.Request("walk", resume=True))
+    del settings["iterations"]
+    assert runner._identity("walk", resumed, manifest["seed"])["settings"] == settings
+    assert resumed.physics == physics and resumed.robot == "nao"
 
 
 @pytest.mark.parametrize("robot", WALKERS)

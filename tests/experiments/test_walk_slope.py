@@ -41,7 +41,7 @@ def settings(tmp_path, monkeypatch):
     clips = [Clip("caption", np.zeros((5, 29)), 0.02)]
     monkeypatch.setattr(walk, "nao_walk", stand_in)
     monkeypatch.setattr(walk_slope, "record", lambda policy, speeds, **_: clips)
-    monkeypatch.setattr(walk_slope, "save_film", lambda clips, path, say: say(f"video: {path}"))
+    monkeypatch.setattr(walk_slope, "save_film", lambda clips, path, say, robot: say(f"video: {path}"))
     monkeypatch.setattr(walk_slope, "SETTINGS", {"quick": settings})
     monkeypatch.chdir(tmp_path)
     return settings
