@@ -32,7 +32,7 @@ from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.motion.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.mstep import WeightedSamples, weighted_ml
-from creps_jax.physics import c, mjx, servos, world
+from creps_jax.physics import c, fit, mjx, servos, world
 from creps_jax.physics import state as physics_state
 from creps_jax.tasks import conditions, functions, planar_arm
 from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, load_nao, record_walk
@@ -408,7 +408,7 @@ MOTION = {
         measured_rpy=VECTOR,
         balance=BALANCE,
     ),
-    "leg_indices": made(nao_geometry.leg_indices, **WALK_POSES),
+    "leg_indices": made(nao_geometry.leg_indices, side=WALK_POSES["side"]),
     "matrix_to_rpy": traced(rotations.matrix_to_rpy, rotation=MATRIX),
     "next_footstep": traced(
         footsteps.next_footstep, params=record(WALK), stance=record(footsteps.standing()), command=VECTOR
@@ -614,6 +614,7 @@ ROWS = {
     ),
     "leg_fk": row(cj.leg_fk, joint_pos=array(np.zeros(6)), **WALK_POSES),
     "leg_ik": row(cj.leg_ik, T_torso_sole=array(np.eye(4)), **WALK_POSES),
+    "check_fit": made(fit.check_fit, model=record(MODEL), robot=record(NAO)),
     "leg_reach": row(nao_kinematics.leg_reach, robot=record(NAO)),
     "leg_ik of a shared motor": row(
         partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))

@@ -14,6 +14,7 @@ _SLACK = 1e-3
 """How far limits (rad), torques (N m) and places (m) of a model may be from those of its robot."""
 
 
+@checks.arguments
 def check_fit(model: mujoco.MjModel, robot: Robot) -> None:
     """Refuse a model that is not the robot's.
 
@@ -27,7 +28,6 @@ def check_fit(model: mujoco.MjModel, robot: Robot) -> None:
             motor for each, or free for one with a single one, or the joints of the legs, or the lowest
             points of spheres under the feet, are elsewhere at the zero pose.
     """
-    checks.instance("model", model, mujoco.MjModel)
     names = tuple(model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu))
     if names != JOINT_NAMES:
         raise ValueError(f"the model's actuators must drive {JOINT_NAMES} in this order, got {names}")

@@ -101,8 +101,8 @@ def test_a_first_policy_of_other_bounds_is_refused(settings):
 
 
 def test_films_show_each_walk_on_its_slope(settings, monkeypatch):
-    def recorded(key, theta, *, values, duration, balance, physics, conditions):
-        del key, theta, balance, physics
+    def recorded(key, theta, *, values, duration, balance, physics, conditions, robot):
+        del key, theta, balance, physics, robot
         assert [condition.name for condition in conditions] == ["slope"]
         time = 0.02 * jnp.arange(1.0, 1 + round(duration / 0.02))
         qpos = jnp.zeros((len(time), 29)).at[:, 0].set(0.1 * values[0] * time)
