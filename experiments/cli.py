@@ -25,6 +25,7 @@ Learn, plot and check what the project can do.
   python -m experiments list                      the experiments by name
   python -m experiments run walk --preset quick   learn to walk, a few minutes
   python -m experiments run walk --speed 0.3      show the learned walk at a speed, in m/s
+  python -m experiments run walk --robot nao_h25  learn it for the real NAO's figures
   python -m experiments run walk --resume         go on with the latest unfinished run
   python -m experiments run all                   the paper's Figures 5 to 9, some ten minutes
   python -m experiments plot walk                 draw the figures of the latest results again
@@ -47,6 +48,7 @@ _Text = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 _Integer = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
 _Number = Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")]
 _Seconds = Annotated[float | None, arg(metavar="S", help_behavior_hint="")]
+_Speeds = Annotated[tuple[float, ...], arg(metavar="[M/S ...]", help_behavior_hint="")]
 _File = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="")]
 
 
@@ -67,6 +69,7 @@ class Run:
         seed: Seed of all random numbers; 0 by default.
         out: Result folder; a new one in results/ by default.
         resume: Go on with the run in the folder --out, or with the latest unfinished one.
+        robot: Who walks: nao, or nao_h25, the real NAO's figures (walk only); nao by default.
         physics: What steps the robot: mjx, c, or auto: c on a CPU, elsewhere mjx (walks only).
         distributed: This is one of several processes, on one host or many, that share the run; see
             docs/several_machines.md.
@@ -81,6 +84,7 @@ class Run:
     seed: _Integer = None
     out: _File = None
     resume: bool = False
+    robot: _Text = None
     physics: _Text = None
     distributed: bool = False
     speed: _Number = None
@@ -117,13 +121,15 @@ class Video:
 
     Attributes:
         policy: Policy file; the latest learned or else the shipped one by default.
-        speeds: Speeds in m/s.
+        robot: Whose policy; nao by default, or the one of the file.
+        speeds: Speeds in m/s; six over the policy's range by default.
         out: The .mp4 file.
         seed: Seed of the noise; 0 by default.
     """
 
     policy: _File = None
-    speeds: tuple[float, ...] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    robot: _Text = None
+    speeds: _Speeds = ()
     out: Path = Path("results/walk.mp4")
     seed: int = 0
 
@@ -136,12 +142,14 @@ class Export:
         to: The file. The policy becomes an ONNX model (.onnx) or a C header (.h); a walk, played from
             standstill and without posture feedback, becomes a table (.csv) or arrays (.npz).
         policy: Policy file; the latest learned or else the shipped one of walking by default.
+        robot: Whose policy; nao by default, or the one of the file.
         speed: Speed of the walk in m/s (.csv and .npz only).
         duration: Length of the walk in s (.csv and .npz only); 8 by default.
     """
 
     to: Annotated[Path, arg(metavar="FILE")]
     policy: _File = None
+    robot: _Text = None
     speed: _Number = None
     duration: _Seconds = None
 
@@ -199,6 +207,8 @@ def _run(command: Run) -> int:
     if command.name == registry.ALL:
         return _run_all(command)
     registry.check_name(command.name)
+    if command.robot is not None and command.name != "walk":
+        raise UserError(f"--robot goes with walk, not with {command.name}")
     if command.speed is not None:
         return _show(command, command.speed)
     if command.policy is not None:
@@ -210,7 +220,7 @@ def _run(command: Run) -> int:
 
     from experiments import runner
 
-    asked = {"iterations": command.iterations, "trials": command.trials, "physics": command.physics}
+    asked = {name: getattr(command, name) for name in ("iterations", "trials", "robot", "physics")}
     request = runner.Request(
         name=command.name,
         preset=command.preset,
@@ -248,7 +258,9 @@ def _show(command: Run, speed: float) -> int:
     import_mjx_quietly()
     from experiments import walking_policy
 
-    walking_policy.show(speed, command.policy, out=command.out, seed=command.seed or 0, say=_say)
+    walking_policy.show(
+        speed, command.policy, robot=command.robot, out=command.out, seed=command.seed or 0, say=_say
+    )
     return 0
 
 
@@ -274,14 +286,23 @@ def _video(command: Video) -> int:
     import_mjx_quietly()
     from experiments import walking_policy
 
-    walking_policy.film(command.speeds, command.policy, out=command.out, seed=command.seed, say=_say)
+    walking_policy.film(
+        command.speeds, command.policy, robot=command.robot, out=command.out, seed=command.seed, say=_say
+    )
     return 0
 
 
 def _export(command: Export) -> int:
     from experiments.export import export
 
-    export(command.to, command.policy, speed=command.speed, duration=command.duration, say=_say)
+    export(
+        command.to,
+        command.policy,
+        robot=command.robot,
+        speed=command.speed,
+        duration=command.duration,
+        say=_say,
+    )
     return 0
 
 

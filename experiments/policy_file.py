@@ -186,9 +186,9 @@ def load_policy(path: Path) -> SavedPolicy:
     return saved
 
 
-def policies_folder() -> Path:
-    """Return the folder of the policies that come with the project."""
-    return ROOT / "models" / "nao" / "policies"
+def policies_folder(robot: str = "nao") -> Path:
+    """Return the folder of the policies of a robot that come with the project."""
+    return ROOT / "models" / robot / "policies"
 
 
 def _check(path: Path, saved: SavedPolicy) -> None:

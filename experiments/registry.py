@@ -47,7 +47,10 @@ class Claim(NamedTuple):
 
 
 class Experiment(Protocol):
-    """What a module of an experiment has; it may also have `finish(settings, arrays, folder, say)`."""
+    """What a module of an experiment has; it may also have `finish(settings, arrays, folder, say)`.
+
+    Its settings may have `resolved()`, which returns them with all that defaults or the machine decide.
+    """
 
     Settings: type[Any]
     SETTINGS: Mapping[str, Any]

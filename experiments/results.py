@@ -187,16 +187,24 @@ def stamp() -> str:
     return datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
-def latest_folder(experiment: str, *, status: str | None = None, root: Path | None = None) -> Path | None:
-    """Find the newest result folder of an experiment, with a given status if one is asked for."""
+def latest_folder(
+    experiment: str, *, status: str | None = None, robot: str | None = None, root: Path | None = None
+) -> Path | None:
+    """Find the newest result folder of an experiment, with a given status and robot if one is asked for."""
     parent = (root or default_root()) / experiment
     found = []
     for path in parent.glob(f"*/{MANIFEST}"):
         with contextlib.suppress(UserError):
             manifest = load_manifest(path.parent)
-            if status is None or manifest.get("status") == status:
+            if status in (None, manifest.get("status")) and robot in (None, robot_of(manifest)):
                 found.append((str(manifest.get("started")), path.parent))
     return max(found)[1] if found else None
+
+
+def robot_of(manifest: Mapping[str, Any]) -> str:
+    """Return whose results a manifest tells of; those of experiments without a robot are the NAO's too."""
+    settings = manifest.get("settings")
+    return str(settings.get("robot", "nao")) if isinstance(settings, Mapping) else "nao"
 
 
 def default_root() -> Path:

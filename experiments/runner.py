@@ -21,6 +21,9 @@ Say = Callable[[str], None]
 _MOST = {"iterations": 1_000_000, "trials": 1_000}
 """What a run can hold in memory, by setting."""
 
+_PAPERS_ROBOT = "nao"
+"""Whose walks are held against the paper's."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Request:
@@ -32,7 +35,8 @@ class Request:
         seed: seed of the random key.
         overrides: settings by name, in place of the preset's.
         out: the result folder.
-        resume: whether to go on with the run in `out`, or with the latest one that has not finished.
+        resume: whether to go on with the run in `out`, or with the latest one that has not finished, of the
+            robot that is asked for, if one is.
     """
 
     name: str
@@ -89,7 +93,8 @@ def run(request: Request, *, console: Console | None, say: Say) -> Path:
         update("failed")
         raise
     update("finished")
-    _save_claims(experiment, arrays, folder)
+    if results.robot_of(manifest) == _PAPERS_ROBOT:
+        _save_claims(experiment, arrays, folder)
     say(f"finished in {manifest['seconds']:.0f} s: {folder}")
     return folder
 
@@ -131,7 +136,7 @@ def check(names: tuple[str, ...], *, say: Say) -> bool:
     all_hold = True
     for name in names or tuple(registry.DESCRIPTIONS):
         registry.check_name(name)
-        folder = results.latest_folder(name, status="finished")
+        folder = results.latest_folder(name, status="finished", robot=_PAPERS_ROBOT)
         if folder is None:
             say(f"{name}: no results yet (python -m experiments run {name})\n")
             continue
@@ -153,9 +158,14 @@ def claim_rows(experiment: registry.Experiment, arrays: Mapping[str, np.ndarray]
 
 
 def _settings(experiment: registry.Experiment, request: Request) -> tuple[str, Any]:
-    """Return the preset and the settings of a run from the beginning."""
+    """Return the preset and the settings of a run from the beginning.
+
+    What they leave to defaults or to the machine is decided here, so that the run, when it is resumed
+    elsewhere or by another version, goes on with the same.
+    """
     preset = request.preset or next(iter(experiment.SETTINGS))
-    return preset, _override(registry.preset_settings(experiment, preset), request)
+    settings = _override(registry.preset_settings(experiment, preset), request)
+    return preset, settings.resolved() if hasattr(settings, "resolved") else settings
 
 
 def _started(experiment: registry.Experiment, request: Request) -> tuple[Any, Path, dict[str, Any]]:
@@ -180,13 +190,17 @@ def _resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Pa
     """Return settings, folder and manifest of a run to go on with."""
     folder = request.out
     if folder is None:
+        robot = request.overrides.get("robot")
         found = [
-            results.latest_folder(request.name, status=status)
+            results.latest_folder(request.name, status=status, robot=robot)
             for status in ("running", "interrupted", "failed")
         ]
         folder = max((path for path in found if path is not None), default=None, key=lambda path: path.name)
         if folder is None:
-            raise UserError(f"there is no unfinished run of {request.name} in {results.default_root()}")
+            asked = "" if robot is None else f" with the robot {robot}"
+            raise UserError(
+                f"there is no unfinished run of {request.name}{asked} in {results.default_root()}"
+            )
     manifest = results.load_manifest(folder)
     for field, kind in (("seed", int), ("seconds", float | int)):
         if not isinstance(manifest.get(field), kind):
@@ -226,6 +240,9 @@ def _override(settings: Any, request: Request) -> Any:
 def _identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
     """Return what has to agree for a checkpoint to belong to a run: all but how long it goes on."""
     same = {key: value for key, value in dataclasses.asdict(settings).items() if key != "iterations"}
+    # Checkpoints from before there was a choice of robots do not name one.
+    if same.get("robot") == _PAPERS_ROBOT:
+        del same["robot"]
     return {"experiment": name, "seed": seed, "settings": same}
 
 

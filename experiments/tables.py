@@ -73,9 +73,14 @@ def speed_table(
         "falls": [f"{int(row.sum())}/{len(row)}" for row in fell],
         "reward": [float(value) for value in reward.mean(axis=1)],
     }
-    if len(asked) == len(PAPER_SPEEDS) and np.allclose(asked, PAPER_SPEEDS, atol=1e-4):
+    if are_the_papers(asked):
         columns |= {"paper RBF": list(PAPER_RBF), "paper linear": list(PAPER_LINEAR)}
     return columns
+
+
+def are_the_papers(asked: np.ndarray) -> bool:
+    """Say whether speeds (m/s) are those of the paper's Table 2."""
+    return len(asked) == len(PAPER_SPEEDS) and np.allclose(asked, PAPER_SPEEDS, atol=1e-4)
 
 
 def _cell(value: object) -> str:

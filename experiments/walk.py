@@ -1,4 +1,4 @@
-"""Teach a NAO to walk at the speed it is asked for (Abdolmaleki et al. 2016, 4.3, Fig. 11, Table 2)."""
+"""Teach a robot to walk at the speed it is asked for (Abdolmaleki et al. 2016, 4.3, Fig. 11, Table 2)."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -16,7 +16,7 @@ from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.creps import Creps, CrepsState, creps
 from creps_jax.features import quadratic_features
-from creps_jax.motion.walking.params import NAO_BOUNDS, PAPER_BOUNDS, PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
+from creps_jax.motion.walking.params import PAPER_BOUNDS, PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c, mjx
 from creps_jax.physics.state import ControlStep
@@ -30,19 +30,24 @@ from experiments.errors import UserError
 from experiments.learning import Log, Plan, Session, learn, make_m_step, trial_keys
 from experiments.policy_file import Features, SavedPolicy, save_policy
 from experiments.registry import Claim
-from experiments.walking_policy import POLICY, START_UP, record, save_film
+from experiments.robots import WALKERS, Bounds, Walker, find_walker
+from experiments.walking_policy import POLICY, START_UP, filmed_speeds, record, save_film
 
-BOUNDS = {"nao": NAO_BOUNDS, "paper": PAPER_BOUNDS}
+BOUNDS = {**{name: walker.bounds for name, walker in WALKERS.items()}, "paper": PAPER_BOUNDS}
 SAMPLERS = {"gaussian": partial(gaussian_contexts, clip=True), "uniform": uniform_contexts}
 CONSTRAINTS = ("sigmoid", "penalty")
 PENALTY = 1000.0
-FILMED_SPEEDS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+NUM_SPEEDS = 11
 TIMESTEP = 0.004
 
 
-def _fastest(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
+def _fastest_name() -> str:
     """Choose what steps the robot: C MuJoCo on a CPU, where it starts sooner and is faster, elsewhere MJX."""
-    return (c if jax.default_backend() == "cpu" else mjx).make_control_step(model, num_substeps)
+    return "c" if jax.default_backend() == "cpu" else "mjx"
+
+
+def _fastest(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
+    return PHYSICS[_fastest_name()](model, num_substeps)
 
 
 PHYSICS = {"auto": _fastest, "mjx": mjx.make_control_step, "c": c.make_control_step}
@@ -53,6 +58,7 @@ class Settings:
     """Settings of the experiment; the preset `paper` is the paper's protocol, as far as DEVIATIONS.md goes.
 
     Attributes:
+        robot: who learns to walk, a name in WALKERS.
         iterations: iterations of learning.
         trials: trials, all learned at once.
         samples: new samples of an iteration, of each trial.
@@ -64,13 +70,13 @@ class Settings:
             paper's unbounded fit.
         cov_kl_bound: how far it may move the covariance, nats.
         features: kind, number and width of the policy's features.
-        bounds: which box the parameters are kept in, a name in BOUNDS.
+        bounds: which box the parameters are kept in, a name in BOUNDS; None is the robot's own.
         constraint: how they are, a name in CONSTRAINTS: squashed by a sigmoid, or by a penalty of the reward.
         start_mean: mean of the first policy before squashing; 0 is the middle of the box.
         start_std: its standard deviation before squashing. With a penalty the first policy is, to first
             order, the same.
-        low: lowest speed, m/s.
-        high: highest speed, m/s.
+        low: lowest speed, m/s; None is the robot's own.
+        high: highest speed, m/s; None is the robot's own.
         duration: length of an episode of the evaluation, s.
         learning_duration: length of an episode in learning, s.
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
@@ -86,6 +92,7 @@ class Settings:
             the faster of them.
     """
 
+    robot: str = "nao"
     iterations: int = 300
     trials: int = 1
     samples: int = 30
@@ -96,12 +103,12 @@ class Settings:
     mean_kl_bound: float | None = None
     cov_kl_bound: float | None = None
     features: Features = Features("rbf", 5)
-    bounds: str = "nao"
+    bounds: str | None = None
     constraint: str = "sigmoid"
     start_mean: float = 0.0
     start_std: float = 1.0
-    low: float = 0.1
-    high: float = 0.6
+    low: float | None = None
+    high: float | None = None
     duration: float = 8.0
     learning_duration: float = 8.0
     heading_gain: float = 0.0
@@ -116,10 +123,35 @@ class Settings:
         # Settings that come back from a manifest are plain.
         if isinstance(self.features, Mapping):
             object.__setattr__(self, "features", Features(**self.features))
-        choices = {"bounds": BOUNDS, "constraint": CONSTRAINTS, "sampler": SAMPLERS, "physics": PHYSICS}
+        find_walker(self.robot)
+        choices = {"constraint": CONSTRAINTS, "sampler": SAMPLERS, "physics": PHYSICS}
+        if self.bounds is not None:
+            choices["bounds"] = BOUNDS
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise UserError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+
+    def resolved(self) -> "Settings":
+        """Return the settings with what None and "auto" stand for here and today, for a run to keep."""
+        walker = self.walker()
+        own = {"low": walker.low, "high": walker.high, "bounds": self.robot}
+        chosen: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name) is None}
+        if self.physics == "auto":
+            chosen["physics"] = _fastest_name()
+        return dataclasses.replace(self, **chosen)
+
+    def walker(self) -> Walker:
+        """Return who learns to walk."""
+        return find_walker(self.robot)
+
+    def box(self) -> Bounds:
+        """Return the box that the parameters are kept in."""
+        return BOUNDS[self.robot if self.bounds is None else self.bounds]
+
+    def speeds(self, num: int = NUM_SPEEDS) -> np.ndarray:
+        """Return so many speeds, evenly over the range, m/s; the paper's 11 for its robot."""
+        low, high = self.context_range()
+        return np.linspace(low[0], high[0], num, dtype=np.float32)
 
     def balance(self) -> Balance:
         """Return how steps answer to the measured orientation."""
@@ -132,7 +164,12 @@ class Settings:
     def context_range(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the lowest and the highest value of each context variable."""
         conditions = self.conditions()
-        return (self.low, *(c.low for c in conditions)), (self.high, *(c.high for c in conditions))
+        walker = self.walker()
+        low, high = (
+            own if asked is None else asked
+            for asked, own in ((self.low, walker.low), (self.high, walker.high))
+        )
+        return (low, *(c.low for c in conditions)), (high, *(c.high for c in conditions))
 
     def margins(self) -> tuple[float, ...]:
         """Return how far beyond its range each context variable is drawn in learning."""
@@ -166,7 +203,7 @@ SETTINGS = {
 
 
 def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
-    """Learn, then evaluate the mean policy of each trial at the paper's speeds with fresh seeds.
+    """Learn, then evaluate the mean policy of each trial at 11 speeds with fresh seeds.
 
     Returns:
         Arrays of the learning (trials, iterations), the policies, their parameters over the speeds
@@ -178,7 +215,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     states, log = learn_to_walk(settings, learn_key, session=session, name="walk")
     policy = states.policy
     speeds, outcome = walk_at_all_speeds(settings, evaluate_key, policy)
-    fine = np.linspace(settings.low, settings.high, 51, dtype=np.float32)
+    fine = settings.speeds(51)
     policies = [
         saved_policy(settings, LinearGaussian(*pair)) for pair in zip(*map(np.asarray, policy), strict=True)
     ]
@@ -190,7 +227,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         "reward": outcome.reward,
         "speed": outcome.speed,
         "fell": outcome.fell,
-        **{f"bound_{side}": np.array(BOUNDS[settings.bounds][i]) for i, side in enumerate(("low", "high"))},
+        **{f"bound_{side}": np.array(settings.box()[i]) for i, side in enumerate(("low", "high"))},
     }
 
 
@@ -232,12 +269,12 @@ def learn_to_walk(
 
 
 def walk_at_all_speeds(settings: Settings, key: jax.Array, policy: LinearGaussian) -> tuple[np.ndarray, Any]:
-    """Roll out the mean policies (trials, ...) at the paper's speeds, with fresh seeds.
+    """Roll out the mean policies (trials, ...) at 11 speeds, for the NAO the paper's, with fresh seeds.
 
     Returns:
         The speeds (n,), m/s, and the outcome (trials, n, seeds).
     """
-    speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
+    speeds = settings.speeds()
     contexts = speeds[:, None]
     thetas = np.asarray(jax.vmap(make_algorithm(settings).mean, (0, None))(policy, contexts))
     return speeds, evaluate_trials(key, make_task(settings), contexts, thetas, repeats=settings.eval_seeds)
@@ -253,8 +290,8 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
     """
     low, high, margin = map(np.array, (*settings.context_range(), settings.margins()))
     task = nao_walk(
-        settings.low,
-        settings.high,
+        float(low[0]),
+        float(high[0]),
         sample_context=SAMPLERS[settings.sampler](low - margin, high + margin),
         duration=settings.duration if duration is None else duration,
         start_up=START_UP,
@@ -262,10 +299,11 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
         balance=settings.balance(),
         physics=PHYSICS[settings.physics],
         conditions=settings.conditions(),
+        robot=settings.walker().robot,
     )
     if settings.constraint == "penalty":
-        return penalised(task, *BOUNDS[settings.bounds], PENALTY)
-    return sigmoid_constrained(task, *BOUNDS[settings.bounds])
+        return penalised(task, *settings.box(), PENALTY)
+    return sigmoid_constrained(task, *settings.box())
 
 
 def make_algorithm(settings: Settings) -> Creps:
@@ -289,7 +327,7 @@ def first_policy(settings: Settings) -> LinearGaussian:
         jnp.full(len(PARAM_NAMES), settings.start_std),
     )
     if settings.constraint == "penalty":
-        low, high = (jnp.asarray(bound) for bound in BOUNDS[settings.bounds])
+        low, high = (jnp.asarray(bound) for bound in settings.box())
         mean, slope = jax.jvp(lambda free: sigmoid_gate(free, low, high), (mean,), (jnp.ones_like(mean),))
         std = slope * std
     coef = jnp.tile(mean, (num_features, 1))
@@ -311,14 +349,14 @@ def evaluate_trials(
 
 def physical(settings: Settings, free: np.ndarray) -> np.ndarray:
     """Turn parameters (..., d) as a squashed policy gives them into those that the robot walks with."""
-    return np.asarray(sigmoid_gate(jnp.asarray(free), *map(jnp.asarray, BOUNDS[settings.bounds])))
+    return np.asarray(sigmoid_gate(jnp.asarray(free), *map(jnp.asarray, settings.box())))
 
 
 def saved_policy(settings: Settings, policy: LinearGaussian) -> SavedPolicy:
     """Put a policy together with all that is needed to use it."""
     conditions = settings.conditions()
     context_low, context_high = settings.context_range()
-    low, high = BOUNDS[settings.bounds]
+    low, high = settings.box()
     return SavedPolicy(
         coef=np.asarray(policy.coef),
         cov_chol=np.asarray(policy.cov_chol),
@@ -332,7 +370,7 @@ def saved_policy(settings: Settings, policy: LinearGaussian) -> SavedPolicy:
         param_low=low,
         param_high=high,
         constraint="sigmoid",
-        task={"name": "walk", "balance": settings.balance()._asdict()},
+        task={"name": "walk", "balance": settings.balance()._asdict(), "robot": settings.robot},
     )
 
 
@@ -345,7 +383,9 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     """Draw the learning curve, each parameter against speed, and reached against asked speed."""
     trial = chosen_trial(arrays)
     speeds = arrays["speeds"].astype(float)
-    lowest = np.asarray(tables.PAPER_SPEEDS) - np.sqrt(-np.asarray(tables.PAPER_RBF) / 10)
+    lowest = None
+    if tables.are_the_papers(speeds):
+        lowest = np.asarray(tables.PAPER_SPEEDS) - np.sqrt(-np.asarray(tables.PAPER_RBF) / 10)
     return {
         **plot_learning(arrays),
         "parameters": plots.parameters_against_context(
@@ -395,8 +435,8 @@ def finish(
     results.save_text(folder / "table.csv", tables.to_csv(columns))
     results.save_text(folder / "table.md", tables.to_markdown(columns))
     say(f"\n{tables.to_markdown(columns)}")
-    speeds = [speed for speed in FILMED_SPEEDS if settings.low <= speed <= settings.high]
-    save_film(record(policy, speeds, seed=0, duration=settings.duration), folder / "walk.mp4", say)
+    clips = record(policy, filmed_speeds(policy), seed=0, duration=settings.duration)
+    save_film(clips, folder / "walk.mp4", say, robot=settings.walker().robot)
 
 
 def param_titles() -> list[str]:

@@ -131,9 +131,9 @@ def warm_start(settings: Settings) -> LinearGaussian:
     """
     path = policies_folder() / "walk.npz"
     shipped = load_policy(path)
-    bounds = walk.BOUNDS[settings.bounds]
-    if shipped.constraint != settings.constraint or (shipped.param_low, shipped.param_high) != bounds:
-        raise UserError(f"{path} has other bounds than {settings.constraint} within {settings.bounds}")
+    if shipped.constraint != settings.constraint or (shipped.param_low, shipped.param_high) != settings.box():
+        wanted = settings.bounds or settings.robot
+        raise UserError(f"{path} has other bounds than {settings.constraint} within {wanted}")
     contexts = context_grid(*settings.context_range(), _FITTED)
     features = jax.vmap(settings.features.make(*settings.context_range()).apply)(contexts)
     wanted = np.stack([shipped.mean(float(speed)) for speed, _ in contexts])
@@ -202,7 +202,7 @@ def finish(
     tables.save_table(table(arrays), folder, say)
     speeds, slopes = zip(*FILMED, strict=True)
     clips = record(policy, speeds, seed=0, duration=settings.duration, slopes=slopes)
-    save_film(clips, folder / "walk_slope.mp4", say)
+    save_film(clips, folder / "walk_slope.mp4", say, robot=settings.walker().robot)
 
 
 def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[object]]:

@@ -8,36 +8,49 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from creps_jax.motion.robots import NAO, Robot
 from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c
 from creps_jax.tasks.conditions import slope
-from creps_jax.tasks.nao_walk import CONTROL_PERIOD, record_walk
+from creps_jax.tasks.nao_walk import CONTROL_PERIOD, model_path, record_walk
 from experiments import results
 from experiments.errors import UserError
 from experiments.policy_file import SavedPolicy, load_policy, policies_folder
+from experiments.robots import find_walker
 from experiments.video import Clip, VideoError, write_video
 
 POLICY = "policy.npz"
 START_UP = 2.0
 _MOST_WALKS = 24
+_FILMED = 6
 
 
-def show(speed: float, path: Path | None, *, out: Path | None, seed: int, say: Callable[[str], None]) -> None:
+def show(
+    speed: float,
+    path: Path | None,
+    *,
+    robot: str | None = None,
+    out: Path | None,
+    seed: int,
+    say: Callable[[str], None],
+) -> None:
     """Show one walk: its parameters, what it reaches, and a video.
 
     Args:
         speed: asked speed, m/s.
-        path: policy file; None is the latest learned one, or else the shipped one.
+        path: policy file; None is the latest learned one of the robot, or else the shipped one.
+        robot: who walks; None is the policy's robot, or without a policy the NAO.
         out: folder of the video, by default `results/walk`.
         seed: seed of the noise.
         say: told one line at a time.
 
     Raises:
-        UserError: if there is no such policy, it is unreadable, or the speed is outside its range.
+        UserError: if there is no such policy, it is unreadable or of another robot, or the speed is outside
+            its range.
     """
-    path = path or default_policy()
-    policy = load_walking_policy(path)
+    path = path or default_policy(robot)
+    policy = load_walking_policy(path, robot)
     theta = policy.theta(speed)
     folder = out or results.default_root() / "walk"
     results.check_writable(folder)
@@ -47,27 +60,40 @@ def show(speed: float, path: Path | None, *, out: Path | None, seed: int, say: C
     video = folder / f"walk-{speed:.2f}.mp4"
     clips = record(policy, (speed,), seed=seed)
     say(clips[0].caption)
-    save_film(clips, video, say)
+    save_film(clips, video, say, robot=robot_of(policy))
 
 
 def film(
-    speeds: Sequence[float], path: Path | None, *, out: Path, seed: int, say: Callable[[str], None]
+    speeds: Sequence[float],
+    path: Path | None,
+    *,
+    robot: str | None = None,
+    out: Path,
+    seed: int,
+    say: Callable[[str], None],
 ) -> None:
-    """Film a policy at several speeds, side by side.
+    """Film a policy at several speeds, side by side; without any, at six over its range.
 
     Raises:
-        UserError: if the policy is unreadable, a speed is outside its range or there are too many, or the
-            video cannot be written.
+        UserError: if the policy is unreadable or of another robot, a speed is outside its range or there are
+            too many, or the video cannot be written.
     """
     if out.suffix != ".mp4" or out.is_dir():
         raise UserError(f"a video must be an .mp4 file, got {out}")
     if len(speeds) > _MOST_WALKS:
         raise UserError(f"a video must show at most {_MOST_WALKS} walks, got {len(speeds)} speeds")
     results.check_writable(out.parent)
-    clips = record(load_walking_policy(path or default_policy()), speeds, seed=seed)
+    policy = load_walking_policy(path or default_policy(robot), robot)
+    clips = record(policy, speeds or filmed_speeds(policy), seed=seed)
     for clip in clips:
         say(clip.caption)
-    save_film(clips, out, say)
+    save_film(clips, out, say, robot=robot_of(policy))
+
+
+def filmed_speeds(policy: SavedPolicy) -> list[float]:
+    """Return six speeds over the range of a policy, m/s."""
+    speeds = np.linspace(policy.context_low[0], policy.context_high[0], _FILMED)
+    return [round(float(speed), 6) for speed in speeds]
 
 
 def record(
@@ -98,6 +124,7 @@ def record(
     )
     # For a few walks, compiling MJX would take longer than they do.
     settings = {"duration": duration, "balance": balance_of(policy), "physics": c.make_control_step}
+    settings["robot"] = robot_of(policy)
     if slopes is not None:
         settings["conditions"] = (slope(policy.context_low[1], policy.context_high[1]),)
     walk = jax.jit(jax.vmap(lambda key, theta, way: record_walk(key, theta, values=way, **settings)))
@@ -115,36 +142,57 @@ def record(
     return clips
 
 
-def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None]) -> None:
+def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None], *, robot: Robot) -> None:
     """Write a video, or say why there is none: it is the one part of a result that a machine may lack."""
     try:
         middle = len(clips[0].qpos) * clips[0].period / 2
-        write_video(path, results.ROOT / "models" / "nao" / "nao.xml", clips, still_at=middle)
+        write_video(path, model_path(robot), clips, still_at=middle)
         say(f"video: {path}")
     except VideoError as error:
         say(str(error))
 
 
-def default_policy() -> Path:
-    """Return the policy of the latest finished run, or else the one that comes with the project.
+def default_policy(robot: str | None = None) -> Path:
+    """Return the policy of a robot's latest finished run, or else the one that comes with the project.
+
+    Args:
+        robot: the robot's name; None is the NAO.
 
     Raises:
-        UserError: if there is neither.
+        UserError: if there is neither, or no such robot.
     """
-    folder = results.latest_folder("walk", status="finished")
+    robot = find_walker(robot or NAO.name).robot.name
+    folder = results.latest_folder("walk", status="finished", robot=robot)
     if folder is not None and (folder / POLICY).exists():
         return folder / POLICY
-    shipped = sorted(policies_folder().glob("*.npz"))
+    return shipped_policy(robot)
+
+
+def shipped_policy(robot: str | None = None) -> Path:
+    """Return the policy of a robot, by default the NAO, that comes with the project.
+
+    Raises:
+        UserError: if there is none, or no such robot.
+    """
+    robot = find_walker(robot or NAO.name).robot.name
+    shipped = sorted(policies_folder(robot).glob("*.npz"))
     if not shipped:
-        raise UserError("no policy has been learned yet: python -m experiments run walk --preset quick")
+        asked = "" if robot == NAO.name else f" --robot {robot}"
+        raise UserError(
+            f"no policy has been learned yet: python -m experiments run walk{asked} --preset quick"
+        )
     return shipped[-1]
 
 
-def load_walking_policy(path: Path) -> SavedPolicy:
+def load_walking_policy(path: Path, robot: str | None = None) -> SavedPolicy:
     """Read a policy file and see that it is one of walking.
 
+    Args:
+        path: the file.
+        robot: whose policy it has to be; None is anyone's.
+
     Raises:
-        UserError: if it is not, or is unreadable.
+        UserError: if it is not, or is unreadable, or of an unknown robot.
     """
     policy = load_policy(path)
     if policy.param_names != PARAM_NAMES:
@@ -158,7 +206,22 @@ def load_walking_policy(path: Path) -> SavedPolicy:
         raise UserError(
             f"{path} does not say how its steps were balanced: expected {wanted}, got {policy.task}"
         )
+    try:
+        found = robot_of(policy).name
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    if robot is not None and find_walker(robot).robot.name != found:
+        raise UserError(f"{path} is a policy of the robot {found}, not of {robot}")
     return policy
+
+
+def robot_of(policy: SavedPolicy) -> Robot:
+    """Return the robot that a policy was learned with: the NAO where the file, an older one, does not say.
+
+    Raises:
+        UserError: if it is unknown.
+    """
+    return find_walker(str(policy.task.get("robot", NAO.name))).robot
 
 
 def balance_of(policy: SavedPolicy) -> Balance:

@@ -28,11 +28,12 @@ import creps_jax as cj
 from creps_jax import rotations, tasks
 from creps_jax.archive import push
 from creps_jax.dual import DualSolution
-from creps_jax.motion import dmp, nao_geometry
+from creps_jax.motion import dmp, nao_geometry, nao_kinematics
+from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.motion.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.mstep import WeightedSamples, weighted_ml
-from creps_jax.physics import c, mjx, servos, world
+from creps_jax.physics import c, fit, mjx, servos, world
 from creps_jax.physics import state as physics_state
 from creps_jax.tasks import conditions, functions, planar_arm
 from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, load_nao, record_walk
@@ -296,7 +297,10 @@ def use_run(result: tuple[cj.CrepsState, cj.IterationLog]) -> Any:
 SOLUTION = DualSolution(
     jnp.float32(1.0), jnp.ones(S), jnp.float32(0.0), num_steps=jnp.int32(3), is_active=jnp.asarray(True)
 )
-WALK_POSES = {"side": Argument(1.0, no_number() | one_of((0, "0"), (jnp.float32(0.5), "0.5")))}
+WALK_POSES = {
+    "side": Argument(1.0, no_number() | one_of((0, "0"), (jnp.float32(0.5), "0.5"))),
+    "robot": record(NAO),
+}
 ANY = (math.nan, math.inf, -math.inf)
 DEVICES = optional(Argument(jax.devices(), NONSENSE | one_of((2, "2"), ([], "[]"), (["cpu"], "['cpu']"))))
 FIT = {
@@ -407,7 +411,7 @@ MOTION = {
         measured_rpy=VECTOR,
         balance=BALANCE,
     ),
-    "leg_indices": made(nao_geometry.leg_indices, **WALK_POSES),
+    "leg_indices": made(nao_geometry.leg_indices, side=WALK_POSES["side"]),
     "matrix_to_rpy": traced(rotations.matrix_to_rpy, rotation=MATRIX),
     "next_footstep": traced(
         footsteps.next_footstep, params=record(WALK), stance=record(footsteps.standing()), command=VECTOR
@@ -613,6 +617,11 @@ ROWS = {
     ),
     "leg_fk": row(cj.leg_fk, joint_pos=array(np.zeros(6)), **WALK_POSES),
     "leg_ik": row(cj.leg_ik, T_torso_sole=array(np.eye(4)), **WALK_POSES),
+    "check_fit": made(fit.check_fit, model=record(MODEL), robot=record(NAO)),
+    "leg_reach": row(nao_kinematics.leg_reach, robot=record(NAO)),
+    "leg_ik of a shared motor": row(
+        partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))
+    ),
     "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
     "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),
     "make_iteration": row(
@@ -638,7 +647,8 @@ ROWS = {
         balance=record(Balance(), heading_gain=number(0.0)),
         conditions=Argument((), NONSENSE | one_of((3, "3"))),
         sample_context=optional(function(TASK.sample_context)),
-        model=optional(record(MODEL)),
+        robot=record(NAO, (NAO_H25, "range of the robot nao_h25")),
+        model=optional(record(MODEL, (load_nao(NAO_H25), "-2.086 to 2.086"))),
         physics=function(lambda model, num_steps: None),
     ),
     "penalised": row(
@@ -782,5 +792,5 @@ def test_every_public_function_has_a_row():
     # What is said of a row, such as "of mjx", follows its name.
     rows = {name.split()[0] for name in ROWS}
     # They take no argument but for a type, or are called for each robot in each step, where checks cost time.
-    assert public - {"load_nao", "standing", "changed_fields"} <= rows
+    assert public - {"load_nao", "model_path", "standing", "changed_fields"} <= rows
     assert {"Importance", "Task"} <= rows and len(names) > 20

@@ -38,7 +38,8 @@ class NaoGeometry(NamedTuple):
     """List the lengths (m), for the left side; `_y` has the other sign on the right.
 
     The three hip axes meet in one point. The knee lies `thigh_forward` ahead of the hip, and at the zero pose
-    so does the ankle. The ankle's two axes do not meet: roll is `ankle_drop` below pitch.
+    so does the ankle. The ankle's two axes need not meet: roll is `ankle_drop` below pitch. The defaults are
+    those of the simulated NAO.
 
     Attributes:
         hip_x: Hip joints, from the torso's centre.
@@ -51,10 +52,12 @@ class NaoGeometry(NamedTuple):
         foot_down: From ankle roll axis to sole.
         foot_front: From ankle to the front edge of the sole.
         foot_back: From ankle to its rear edge, negative.
-        foot_half_width: From ankle to its side edges.
+        foot_inner: From ankle to its edge towards the other foot.
+        foot_outer: From ankle to its other side edge.
         shoulder_y: Shoulder joints, from the torso's centre.
         shoulder_z: The same, upward.
         elbow_forward: From shoulder to elbow, the arm stretched forward.
+        elbow_out: The same, to the side.
         elbow_up: The same, upward.
         neck_z: Neck, from the torso's centre.
         head_pitch_z: Head pitch axis, from the torso's centre.
@@ -70,10 +73,12 @@ class NaoGeometry(NamedTuple):
     foot_down: float = 0.045
     foot_front: float = 0.110
     foot_back: float = -0.050
-    foot_half_width: float = 0.040
+    foot_inner: float = 0.040
+    foot_outer: float = 0.040
     shoulder_y: float = 0.098
     shoulder_z: float = 0.075
     elbow_forward: float = 0.090
+    elbow_out: float = 0.0
     elbow_up: float = 0.009
     neck_z: float = 0.090
     head_pitch_z: float = 0.150

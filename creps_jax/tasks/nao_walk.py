@@ -1,4 +1,4 @@
-"""The walking task: a simulated NAO walks straight ahead, from standstill, at the speed it is asked for."""
+"""The walking task: a simulated robot walks straight ahead, from standstill, at the speed it is asked for."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -13,12 +13,14 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
-from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_NAMES, NUM_JOINTS
+from creps_jax.motion.nao_geometry import NUM_JOINTS, NaoGeometry
+from creps_jax.motion.robots import NAO, Robot
 from creps_jax.motion.walking.engine import BodyPose, plan_walk, pose_at, pose_joints, stand_upright
 from creps_jax.motion.walking.params import PARAM_NAMES, WalkParams, count_steps, params_from_theta
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.motion.walking.set_points import next_set_point
 from creps_jax.physics import mjx
+from creps_jax.physics.fit import check_fit
 from creps_jax.physics.state import ControlStep, RobotState, initial_state
 from creps_jax.physics.world import world_of
 from creps_jax.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
@@ -33,11 +35,21 @@ from creps_jax.tasks.conditions import (
 )
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
 
-__all__ = ["WalkNoise", "WalkOutcome", "WalkRecord", "WalkReward", "load_nao", "nao_walk", "record_walk"]
+__all__ = [
+    "WalkNoise",
+    "WalkOutcome",
+    "WalkRecord",
+    "WalkReward",
+    "load_nao",
+    "model_path",
+    "nao_walk",
+    "record_walk",
+]
 
 CONTROL_PERIOD = 0.02
-# The torso centre stands .315 m high with the knees bent most; upright means within 50 degrees of it.
-_FALLEN_HEIGHT = 0.2
+# Share of the torso's height with straight legs; with the knees bent most it still has .8 of it. Upright
+# means within 50 degrees.
+_FALLEN_SHARE = 0.2 / 0.385
 _FALLEN_COSINE = 0.64
 # All control steps are planned before the first: a longer episode would fill the memory.
 _LONGEST = 3600.0
@@ -128,25 +140,37 @@ class _Progress(NamedTuple):
     has_fallen: Array
 
 
-def load_nao() -> mujoco.MjModel:
-    """Load the NAO for simulation, from the checkout or from the installed package.
+def load_nao(robot: Robot = NAO) -> mujoco.MjModel:
+    """Load a NAO for simulation, from the checkout or from the installed package.
 
     What is only there to be looked at is left out. So are the joint limits' constraints, a third of all
     constraint rows: the set-points keep within the limits, and the servos hold the joints near them.
 
+    Args:
+        robot: The simulated NAO, or `creps_jax.motion.robots.NAO_H25`, the real one.
+
     Raises:
         FileNotFoundError: If the model file is in neither place.
+    """
+    spec = mujoco.MjSpec.from_file(str(model_path(robot)))
+    spec.compiler.discardvisual = True
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
+    return spec.compile()
+
+
+def model_path(robot: Robot) -> Path:
+    """Return the file of a robot's model, in the checkout or in the installed package.
+
+    Raises:
+        FileNotFoundError: If it is in neither place.
     """
     package = Path(__file__).resolve().parents[1]
     folders = (package.parent / "models", package / "models")
     for folder in folders:
-        path = folder / "nao" / "nao.xml"
+        path = folder / robot.name / f"{robot.name}.xml"
         if path.is_file():
-            spec = mujoco.MjSpec.from_file(str(path))
-            spec.compiler.discardvisual = True
-            spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
-            return spec.compile()
-    raise FileNotFoundError(f"nao/nao.xml is in none of {', '.join(map(str, folders))}")
+            return path
+    raise FileNotFoundError(f"{robot.name}/{robot.name}.xml is in none of {', '.join(map(str, folders))}")
 
 
 @checks.arguments
@@ -161,6 +185,7 @@ def nao_walk(
     noise: WalkNoise = WalkNoise(),
     balance: Balance = Balance(),
     conditions: Sequence[Condition] = (),
+    robot: Robot = NAO,
     model: mujoco.MjModel | None = None,
     physics: Physics = mjx.make_control_step,
 ) -> Task:
@@ -170,11 +195,17 @@ def nao_walk(
     speed is the displacement of the torso, in the frame of the start, over the time from the end of the
     start-up to the end of the episode. A fall ends the episode, and the speed up to it counts.
 
+    The robot may be any humanoid whose legs `leg_ik` can drive, with the joints of the NAO. Those of
+    `creps_jax.motion.robots`, `NAO` and `NAO_H25`, come with their models, another one is a `Robot` of its
+    own and a model that fits it.
+
     With further conditions, such as the slope of the floor, the context is the speed and the value of each.
 
     Args:
-        low: Lowest speed that is asked for, m/s.
-        high: Highest speed that is asked for, m/s.
+        low: Lowest speed that is asked for, m/s. The default range is that of `NAO`, for any robot; that of
+            another one is the caller's to choose, for `NAO_H25` about .05 to .3, as is the box of theta,
+            for `NAO_H25` `creps_jax.motion.walking.params.NAO_H25_BOUNDS`.
+        high: Highest speed that is asked for, m/s; see `low`.
         sample_context: (key) -> context (1 + k,); by default Gaussian about the middle, clipped to the range.
         duration: Length of the episode, s.
         start_up: Length of the time at its start over which the speed does not count, s.
@@ -182,7 +213,8 @@ def nao_walk(
         noise: Sizes of the noise.
         balance: How steps answer to the measured orientation; by default not at all, as in the paper.
         conditions: The k conditions that the context tells besides the speed, see `tasks.conditions`.
-        model: The robot; by default `load_nao()`.
+        robot: Who walks.
+        model: Its model; by default `load_nao(robot)`.
         physics: What steps the robot: `physics.mjx.make_control_step`, which any device runs, or
             `physics.c.make_control_step`, the host's C MuJoCo.
 
@@ -191,7 +223,8 @@ def nao_walk(
 
     Raises:
         ValueError: If the range or the times are not in order, there are two conditions of one name or one
-            that begins after the end, or the model is not driven by the NAO's joints.
+            that begins after the end, or the model is not that of the robot: driven by other joints, in other
+            limits or with other torques, or with other legs.
 
     Source: Abdolmaleki et al. 2016, Section 4.3.
     """
@@ -201,7 +234,7 @@ def nao_walk(
         raise ValueError(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
         )
-    begin, advance = _make_walker(model, duration, noise, balance, physics, conditions)
+    begin, advance = _make_walker(robot, model, duration, noise, balance, physics, conditions)
     if sample_context is None:
         lows, highs = [low, *(c.low for c in conditions)], [high, *(c.high for c in conditions)]
         sample_context = gaussian_contexts(lows, highs, clip=True)
@@ -219,13 +252,13 @@ def nao_walk(
 
         def step(progress):
             # A batch goes on until its last robot has fallen; a state of NaN spares C MuJoCo the others.
-            robot = jax.tree.map(lambda x: jnp.where(progress.has_fallen, jnp.nan, x), progress.robot)
-            robot, set_point = advance(walk, progress.tick, robot, progress.set_point)
+            state = jax.tree.map(lambda x: jnp.where(progress.has_fallen, jnp.nan, x), progress.robot)
+            state, set_point = advance(walk, progress.tick, state, progress.set_point)
             tick = progress.tick + 1
             is_start_up = tick <= start_up_ticks
-            measured_from = lax.select(is_start_up, robot.qpos[:2], progress.measured_from)
-            has_fallen = _has_fallen(robot.qpos, walk.circumstances)
-            return _Progress(tick, robot, set_point, measured_from, has_fallen)
+            measured_from = lax.select(is_start_up, state.qpos[:2], progress.measured_from)
+            has_fallen = _has_fallen(robot, state.qpos, walk.circumstances)
+            return _Progress(tick, state, set_point, measured_from, has_fallen)
 
         end = lax.while_loop(is_walking, step, start)
         measured = jnp.maximum(end.tick - start_up_ticks, 1).astype(theta.dtype) * CONTROL_PERIOD
@@ -250,6 +283,7 @@ def record_walk(
     balance: Balance = Balance(),
     conditions: Sequence[Condition] = (),
     values: Float[Array, " k"] | Float[np.ndarray, " k"] | None = None,
+    robot: Robot = NAO,
     model: mujoco.MjModel | None = None,
     physics: Physics = mjx.make_control_step,
 ) -> WalkRecord:
@@ -263,7 +297,8 @@ def record_walk(
         balance: See `nao_walk`.
         conditions: See `nao_walk`.
         values: Value of each condition.
-        model: The robot; by default `load_nao()`.
+        robot: See `nao_walk`.
+        model: See `nao_walk`.
         physics: See `nao_walk`.
 
     Returns:
@@ -272,14 +307,14 @@ def record_walk(
     Raises:
         ValueError: If there is not one value for each condition.
     """
-    begin, advance = _make_walker(model, duration, noise, balance, physics, conditions)
+    begin, advance = _make_walker(robot, model, duration, noise, balance, physics, conditions)
     walk = begin(key, theta, values)
 
     def step(carry, tick):
-        robot, set_point, has_fallen = carry
-        robot, set_point = advance(walk, tick, robot, set_point)
-        has_fallen = has_fallen | _has_fallen(robot.qpos, walk.circumstances)
-        return (robot, set_point, has_fallen), (robot.qpos, set_point, has_fallen)
+        state, set_point, has_fallen = carry
+        state, set_point = advance(walk, tick, state, set_point)
+        has_fallen = has_fallen | _has_fallen(robot, state.qpos, walk.circumstances)
+        return (state, set_point, has_fallen), (state.qpos, set_point, has_fallen)
 
     ticks = jnp.arange(round(duration / CONTROL_PERIOD), dtype=jnp.int32)
     _, (qpos, set_point, has_fallen) = lax.scan(step, (walk.robot, walk.set_point, jnp.asarray(False)), ticks)
@@ -288,16 +323,16 @@ def record_walk(
     )
 
 
-def _make_walker(model, duration, noise, balance, physics, conditions=()):
-    """Check settings; return `begin(key, theta, values)` and `advance(walk, tick, robot, set_point)`."""
+def _make_walker(robot, model, duration, noise, balance, physics, conditions=()):
+    """Check settings; return `begin(key, theta, values)` and `advance(walk, tick, state, set_point)`."""
     if not CONTROL_PERIOD <= duration <= _LONGEST:
         raise ValueError(f"duration must be {CONTROL_PERIOD} to {_LONGEST:g} s, got {duration}")
     _check_numbers("noise", noise, least=0.0)
     _check_numbers("balance", balance)
     check_conditions(conditions, duration)
     checks.function("physics", physics, "(model, number of steps) -> control step")
-    model = load_nao() if model is None else model
-    _check_model(model)
+    model = load_nao(robot) if model is None else model
+    _check_model(model, robot)
     control_step = physics(model, round(CONTROL_PERIOD / model.opt.timestep))
     num_ticks = round(duration / CONTROL_PERIOD)
 
@@ -306,10 +341,10 @@ def _make_walker(model, duration, noise, balance, physics, conditions=()):
         values = jnp.zeros(0, theta.dtype) if values is None else checks.array("values", values)
         circumstances = circumstances_of(conditions, values, world_of(model))
         params = params_from_theta(theta)
-        plans = plan_walk(params, count_steps(duration))
+        plans = plan_walk(params, count_steps(duration), robot=robot)
 
         def planned(time):
-            pose = pose_at(params, plans, time)
+            pose = pose_at(params, plans, time, robot=robot)
             return pose if circumstances is None else stand_upright(pose, slope_angle(circumstances.world))
 
         if circumstances is not None:
@@ -318,9 +353,10 @@ def _make_walker(model, duration, noise, balance, physics, conditions=()):
             params = params._replace(lean=params.lean + slope_angle(circumstances.world))
         first = planned(jnp.zeros_like(params.lean))
         upright = jnp.stack([jnp.zeros_like(params.lean), params.lean, jnp.zeros_like(params.lean)])
-        set_point = pose_joints(params, first, upright)
+        set_point = pose_joints(params, first, upright, robot=robot)
         joints = set_point + noise.start * jax.random.normal(start_key, (NUM_JOINTS,), theta.dtype)
-        robot = initial_state(jnp.concatenate([_torso_over(first, params.lean), joints]), model.nv)
+        torso = _torso_over(first, params.lean, robot.geometry)
+        state = initial_state(jnp.concatenate([torso, joints]), model.nv)
         times = jnp.arange(1, num_ticks + 1, dtype=theta.dtype) * CONTROL_PERIOD
         poses = jax.vmap(planned)(times)
         lean_noise = noise.lean * jax.random.normal(lean_key, (num_ticks, 3), theta.dtype)
@@ -328,44 +364,44 @@ def _make_walker(model, duration, noise, balance, physics, conditions=()):
             set_point_key, (num_ticks, NUM_JOINTS), theta.dtype
         )
         set_point_noise = jnp.concatenate([jnp.zeros((1, NUM_JOINTS), theta.dtype), set_point_noise])
-        return _Walk(robot, set_point, params, poses, lean_noise, set_point_noise, circumstances)
+        return _Walk(state, set_point, params, poses, lean_noise, set_point_noise, circumstances)
 
-    def advance(walk: _Walk, tick: Array, robot: RobotState, set_point: Array) -> tuple[RobotState, Array]:
+    def advance(walk: _Walk, tick: Array, state: RobotState, set_point: Array) -> tuple[RobotState, Array]:
         pose, lean_noise = jax.tree.map(lambda leaf: leaf[tick], (walk.poses, walk.lean_noise))
-        measured = quat_to_rpy(robot.qpos[3:7]) + lean_noise
-        target = pose_joints(walk.params, pose, measured, balance=balance)
-        target = next_set_point(set_point, target, CONTROL_PERIOD)
+        measured = quat_to_rpy(state.qpos[3:7]) + lean_noise
+        target = pose_joints(walk.params, pose, measured, balance=balance, robot=robot)
+        target = next_set_point(set_point, target, CONTROL_PERIOD, robot=robot)
         # The servos miss their set-points by the noise; the speed that they are told is the planned one.
         before = set_point + walk.set_point_noise[tick]
         after = target + walk.set_point_noise[tick + 1]
         speed = (target - set_point) / CONTROL_PERIOD
         if walk.circumstances is None:
-            return control_step(robot, before, after, speed), target
-        robot = _pushed(robot, tick, walk.circumstances)
-        return control_step(robot, before, after, speed, walk.circumstances.world), target
+            return control_step(state, before, after, speed), target
+        state = _pushed(state, tick, walk.circumstances)
+        return control_step(state, before, after, speed, walk.circumstances.world), target
 
     return begin, advance
 
 
-def _torso_over(pose: BodyPose, lean: Scalar) -> Array:
+def _torso_over(pose: BodyPose, lean: Scalar, geometry: NaoGeometry) -> Array:
     """Return the position and quaternion of a torso that leans over the hips of a pose."""
-    hip_centre = jnp.array([GEOMETRY.hip_x, 0.0, GEOMETRY.hip_z], lean.dtype)
+    hip_centre = jnp.array([geometry.hip_x, 0.0, geometry.hip_z], lean.dtype)
     position = pose.hips[:3] - rotation_y(lean) @ hip_centre
     zero = jnp.zeros_like(lean)
     return jnp.concatenate([position, rpy_to_quat(jnp.stack([zero, lean, zero]))])
 
 
-def _pushed(robot: RobotState, tick: Array, circumstances: Circumstances) -> RobotState:
-    """Return the robot after the push, if there is one and it comes in this control step."""
+def _pushed(state: RobotState, tick: Array, circumstances: Circumstances) -> RobotState:
+    """Return the state of the robot after the push, if there is one and it comes in this control step."""
     if circumstances.push_time is None:
-        return robot
+        return state
     is_now = tick == round(circumstances.push_time / CONTROL_PERIOD)
-    return robot._replace(qvel=robot.qvel.at[1].add(jnp.where(is_now, circumstances.push, 0.0)))
+    return state._replace(qvel=state.qvel.at[1].add(jnp.where(is_now, circumstances.push, 0.0)))
 
 
-def _has_fallen(qpos: Array, circumstances: Circumstances | None) -> Array:
+def _has_fallen(robot: Robot, qpos: Array, circumstances: Circumstances | None) -> Array:
     """Say whether the torso is low or far from upright; a state that is not finite counts as fallen."""
-    is_high = qpos[2] > _FALLEN_HEIGHT
+    is_high = qpos[2] > _FALLEN_SHARE * robot.geometry.torso_height
     rotation = quat_to_matrix(qpos[3:7])
     cosine = rotation[2, 2] if circumstances is None else upward(circumstances.world) @ rotation[:, 2]
     return ~(is_high & (cosine > _FALLEN_COSINE))
@@ -376,11 +412,9 @@ def _check_numbers(name: str, record: WalkReward | WalkNoise | Balance, *, least
         checks.number(f"{name}.{field}", value, least=least)
 
 
-def _check_model(model: mujoco.MjModel) -> None:
-    """Refuse a model with other actuators, or with a time step that does not divide a control step."""
-    names = tuple(model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu))
-    if names != JOINT_NAMES:
-        raise ValueError(f"the model's actuators must drive {JOINT_NAMES} in this order, got {names}")
+def _check_model(model: mujoco.MjModel, robot: Robot) -> None:
+    """Refuse a model that is not the robot's, or whose time step does not divide a control step."""
+    check_fit(model, robot)
     ratio = CONTROL_PERIOD / model.opt.timestep
     if abs(ratio - round(ratio)) > 1e-6:
         raise ValueError(

@@ -1,9 +1,10 @@
-"""Evaluate a walking policy at the paper's 11 speeds, 50 fresh episodes each, beside the paper's Table 2.
+"""Evaluate a walking policy at 11 speeds, 50 fresh episodes each; the NAO's beside the paper's Table 2.
 
-    python -m experiments.benchmarks.policy [POLICY.npz] [--noise TIMES] [--placement-gain GAIN]
+    python -m experiments.benchmarks.policy [POLICY.npz] [--robot NAME] [--noise TIMES]
+                                            [--placement-gain GAIN]
 
-Without a file it is the shipped policy. The options show what more noise, or steps that answer to a sideways
-tilt otherwise than those that the policy was learned with, do to it.
+Without a file it is the shipped policy of the robot. The last options show what more noise, or steps that
+answer to a sideways tilt otherwise than those that the policy was learned with, do to it.
 """
 
 from experiments.process import import_mjx_quietly, prepare
@@ -25,14 +26,16 @@ from creps_jax.tasks.nao_walk import WalkNoise, nao_walk  # noqa: E402
 from creps_jax.train import evaluate  # noqa: E402
 from experiments import tables  # noqa: E402
 from experiments.errors import UserError  # noqa: E402
-from experiments.policy_file import SavedPolicy, policies_folder  # noqa: E402
-from experiments.walking_policy import balance_of, load_walking_policy  # noqa: E402
+from experiments.policy_file import SavedPolicy  # noqa: E402
+from experiments.walk import NUM_SPEEDS  # noqa: E402
+from experiments.walking_policy import balance_of, load_walking_policy, robot_of, shipped_policy  # noqa: E402
 
 SEEDS = 50
 
 
 def main(
-    policy: tyro.conf.Positional[Path] = policies_folder() / "walk.npz",  # noqa: B008
+    policy: tyro.conf.Positional[Path | None] = None,
+    robot: str | None = None,
     noise: float = 1.0,
     placement_gain: float | None = None,
 ) -> None:
@@ -40,25 +43,30 @@ def main(
 
     Args:
         policy: Policy file; the shipped one by default.
+        robot: Whose policy; nao by default, or the one of the file.
         noise: How many times the usual noise.
         placement_gain: In place of the one that the policy was learned with.
     """
-    saved = load_walking_policy(policy)
+    saved = load_walking_policy(policy or shipped_policy(robot), robot)
     balance = balance_of(saved)
     if placement_gain is not None:
         balance = balance._replace(placement_gain=placement_gain)
-    outcome = walk_at_all_speeds(saved, nao_walk(balance=balance, noise=WalkNoise().times(noise)), seed=2026)
+    task = nao_walk(robot=robot_of(saved), balance=balance, noise=WalkNoise().times(noise))
+    outcome = walk_at_all_speeds(saved, task, seed=2026)
     print(
-        tables.to_markdown(
-            tables.speed_table(np.asarray(tables.PAPER_SPEEDS), outcome.reward, outcome.speed, outcome.fell)
-        )
+        tables.to_markdown(tables.speed_table(speeds_of(saved), outcome.reward, outcome.speed, outcome.fell))
     )
     print(f"mean reward {outcome.reward.mean():.4f}, falls {int(outcome.fell.sum())} of {outcome.fell.size}")
 
 
+def speeds_of(saved: SavedPolicy) -> np.ndarray:
+    """Return 11 speeds over the range of a policy, m/s: for the NAO the paper's."""
+    return np.linspace(saved.context_low[0], saved.context_high[0], NUM_SPEEDS, dtype=np.float32)
+
+
 def walk_at_all_speeds(saved: SavedPolicy, task: Task, *, seed: int) -> Any:
-    """Roll out a policy at the paper's speeds with fresh noise; the outcome has axes (speeds, seeds)."""
-    speeds = np.asarray(tables.PAPER_SPEEDS, np.float32)
+    """Roll out a policy at 11 speeds with fresh noise; the outcome has axes (speeds, seeds)."""
+    speeds = speeds_of(saved)
     thetas = jnp.stack([jnp.asarray(saved.theta(float(speed))) for speed in speeds])
     outcome = evaluate(jax.random.key(seed), task, jnp.asarray(speeds)[:, None], thetas, repeats=SEEDS)
     return jax.tree.map(np.asarray, outcome)

@@ -2,9 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from experiments.errors import UserError
 from experiments.process import import_mjx_quietly
+
+if TYPE_CHECKING:
+    from experiments.policy_file import SavedPolicy
 
 _OF_POLICY = {".onnx": "ONNX model", ".h": "C header"}
 _OF_WALK = {".csv": "CSV table", ".npz": "NumPy arrays"}
@@ -15,6 +19,7 @@ def export(
     to: Path,
     policy: Path | None,
     *,
+    robot: str | None = None,
     speed: float | None,
     duration: float | None,
     say: Callable[[str], None],
@@ -23,7 +28,8 @@ def export(
 
     Args:
         to: the file; its ending says what it shall be. One that is there is overwritten.
-        policy: policy file; None is the latest learned walking policy, or else the shipped one.
+        policy: policy file; None is the latest learned walking policy of the robot, or else the shipped one.
+        robot: whose walking policy it is; None is the policy's robot, or without a policy the NAO.
         speed: speed of the walk, m/s; only for a walk, which needs it.
         duration: length of the walk, s; only for a walk, 8 by default.
         say: told one line at a time.
@@ -34,20 +40,21 @@ def export(
     ending = to.suffix.lower()
     _check_request(to, ending, speed, duration)
     # Everything else is imported late: it takes seconds, and mistakes are answered at once.
-    path = policy or _default_policy()
+    path = policy or _default_policy(robot)
     if _are_the_same(to, path):
         raise UserError(f"--to {to} is the policy file itself, name another file")
     if speed is not None:
         import_mjx_quietly()
         from experiments.export import trajectory
 
-        walk = trajectory.plan(path, speed, _DURATION if duration is None else duration)
+        walk = trajectory.plan(path, speed, _DURATION if duration is None else duration, robot=robot)
         {".csv": trajectory.save_csv, ".npz": trajectory.save_npz}[ending](to, walk)
     else:
         from experiments.export import c_header, onnx_model
         from experiments.policy_file import load_policy
 
-        {".onnx": onnx_model.save, ".h": c_header.save}[ending](to, load_policy(path))
+        saved = load_policy(path) if robot is None else _load_walking_policy(path, robot)
+        {".onnx": onnx_model.save, ".h": c_header.save}[ending](to, saved)
     say(f"policy: {path}")
     say(f"{(_OF_POLICY | _OF_WALK)[ending]}: {to}")
 
@@ -74,8 +81,15 @@ def _are_the_same(path: Path, other: Path) -> bool:
         return False
 
 
-def _default_policy() -> Path:
+def _default_policy(robot: str | None) -> Path:
     import_mjx_quietly()
     from experiments.walking_policy import default_policy
 
-    return default_policy()
+    return default_policy(robot)
+
+
+def _load_walking_policy(path: Path, robot: str) -> "SavedPolicy":
+    import_mjx_quietly()
+    from experiments.walking_policy import load_walking_policy
+
+    return load_walking_policy(path, robot)

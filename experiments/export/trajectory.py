@@ -15,7 +15,7 @@ from creps_jax.tasks.nao_walk import CONTROL_PERIOD
 from experiments import tables
 from experiments.errors import UserError
 from experiments.results import save_arrays, save_text
-from experiments.walking_policy import load_walking_policy
+from experiments.walking_policy import load_walking_policy, robot_of
 
 # Time and place grow along the way, and lose digits in single precision.
 _LONGEST = 600.0
@@ -35,7 +35,7 @@ class Trajectory(NamedTuple):
     set_point: np.ndarray
 
 
-def plan(path: Path, speed: float, duration: float) -> Trajectory:
+def plan(path: Path, speed: float, duration: float, *, robot: str | None = None) -> Trajectory:
     """Plan a walk at a speed, with the engine alone.
 
     The trunk is taken to lean as intended at all times, without noise. Posture feedback, which answers to
@@ -46,17 +46,18 @@ def plan(path: Path, speed: float, duration: float) -> Trajectory:
         path: policy file.
         speed: asked speed, m/s.
         duration: length of the walk, s.
+        robot: whose policy it has to be; None is anyone's.
 
     Raises:
-        UserError: if it is no policy of walking, or speed or duration are out of range.
+        UserError: if it is no policy of walking, or of another robot, or speed or duration are out of range.
     """
-    policy = load_walking_policy(path)
+    policy = load_walking_policy(path, robot)
     if policy.task.get("name") != "walk":
         raise UserError(f"{path} is no walking policy: its task is {policy.task.get('name')!r}")
     if not CONTROL_PERIOD <= duration <= _LONGEST:
         raise UserError(f"--duration must be {CONTROL_PERIOD} to {_LONGEST:g} s, got {duration}")
     theta = policy.theta(speed)
-    walk = partial(open_loop_set_points, duration=duration, period=CONTROL_PERIOD)
+    walk = partial(open_loop_set_points, duration=duration, period=CONTROL_PERIOD, robot=robot_of(policy))
     set_point = np.asarray(jax.jit(lambda theta: walk(params_from_theta(theta)))(jnp.asarray(theta)))
     return Trajectory(speed, np.arange(len(set_point)) * CONTROL_PERIOD, set_point)
 

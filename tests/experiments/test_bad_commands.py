@@ -30,6 +30,8 @@ NO_SPEEDS = WORDS | st.one_of(
     st.floats(max_value=0.09), st.floats(min_value=0.61), st.just(float("nan"))
 ).map(str)
 NO_NAMES = st.text("abcdefgh_/.", min_size=1, max_size=12)
+# The policy of the fixture is the NAO's.
+NO_ROBOTS = NO_NAMES | st.just("nao_h25")
 # As files and folders of the fixture: there is none, it is no file, or no whole one.
 NO_POLICIES = st.sampled_from(
     ["none.npz", "full", "file", "cut.npz", "file/p.npz", "nan.npz", "reversed.npz"]
@@ -58,6 +60,8 @@ COMMANDS = {
         option("run", "tiny", "--seed", values=NO_SEEDS),
         option("run", "tiny", "--out", values=NO_NEW_FOLDERS),
         option("run", "walk", "--physics", values=NO_NAMES),
+        option("run", "walk", "--robot", values=NO_NAMES),
+        option("run", "tiny", "--robot", values=st.just("nao_h25")).map(lambda it: (it[0], "--robot")),
     ),
     "run --resume": st.one_of(
         option("run", "tiny", "--resume", "--out", values=NO_RESULTS),
@@ -68,6 +72,7 @@ COMMANDS = {
         option("run", "walk", "--speed", "0.3", "--policy", values=NO_POLICIES),
         option("run", "walk", "--speed", "0.3", "--policy", "whole.npz", "--seed", values=NO_SEEDS),
         option("run", "walk", "--speed", "0.3", "--policy", "whole.npz", "--out", values=NO_FOLDERS),
+        option("run", "walk", "--speed", "0.3", "--policy", "whole.npz", "--robot", values=NO_ROBOTS),
     ),
     "plot": st.one_of(
         option("plot", values=NO_NAMES),
@@ -79,6 +84,7 @@ COMMANDS = {
         option("video", "--policy", values=NO_POLICIES),
         option("video", "--policy", "whole.npz", "--seed", values=NO_SEEDS),
         option("video", "--policy", "whole.npz", "--out", values=NO_VIDEOS),
+        option("video", "--policy", "whole.npz", "--robot", values=NO_ROBOTS),
         st.integers(25, 1000).map(lambda num: (["video", "--speeds", *["0.3"] * num], str(num))),
     ),
     "export": st.one_of(

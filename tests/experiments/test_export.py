@@ -15,6 +15,7 @@ import onnxruntime
 import pytest
 
 from creps_jax.motion.nao_geometry import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, MAX_JOINT_SPEED
+from creps_jax.motion.robots import NAO_H25
 from experiments.cli import main
 from experiments.errors import UserError
 from experiments.export.c_header import make_header
@@ -23,6 +24,7 @@ from experiments.policy_file import Features, SavedPolicy, load_policy, policies
 from experiments.results import load_arrays
 
 SHIPPED = policies_folder() / "walk.npz"
+H25 = ("--robot", "nao_h25")
 NAN, INFINITE = float("nan"), float("inf")
 
 
@@ -247,6 +249,21 @@ def test_the_command_writes_the_set_points_of_a_walk(folder):
     np.testing.assert_array_equal(np.array(rows)[:, 1:].astype(np.float32), set_point)
 
 
+def test_a_robot_gets_its_own_policy_and_set_points(folder, capsys):
+    assert main(["export", "--robot", "nao_h25", "--to", "h25.npz", "--speed", "0.2", "--duration", "1"]) == 0
+    shipped = policies_folder("nao_h25") / "walk.npz"
+    assert capsys.readouterr().out.splitlines()[0] == f"policy: {shipped}"
+    set_point = load_arrays(folder / "h25.npz")["set_point"]
+    low, high = np.float32(NAO_H25.joint_lower), np.float32(NAO_H25.joint_upper)
+    assert ((set_point >= low) & (set_point <= high)).all()
+    # Its elbows do not stretch, and one motor turns both hips.
+    assert low[JOINT_NAMES.index("right_elbow")] > 0
+    left, right = (set_point[:, JOINT_NAMES.index(f"{side}_hip_yaw_pitch")] for side in ("left", "right"))
+    np.testing.assert_allclose(left, right, atol=1e-6)
+    assert main(["export", "--robot", "nao_h25", "--to", "h25.h"]) == 0
+    assert (folder / "h25.h").read_text() == make_header(load_policy(shipped))
+
+
 def test_mistakes_are_one_clear_line(folder, capsys):
     other = dataclasses.replace(POLICIES["walk"], task={**POLICIES["walk"].task, "name": "swim"})
     for name, policy in (("reach", POLICIES["squashed"]), ("walk", POLICIES["walk"]), ("swim", other)):
@@ -260,6 +277,8 @@ def test_mistakes_are_one_clear_line(folder, capsys):
         ("no such file: none.npz", ["--to", "walk.h", "--policy", "none.npz"]),
         ("is no walking policy: its parameters are a b, a-b", [*walk, "--policy", "reach.npz"]),
         ("is no walking policy: its task is 'swim'", [*walk, "--policy", "swim.npz"]),
+        (f"{SHIPPED} is a policy of the robot nao, not of", [*walk, "--policy", str(SHIPPED), *H25]),
+        ("is a policy of the robot nao, not of nao_h25", ["--to", "w.h", "--policy", str(SHIPPED), *H25]),
         ("learned range, 0.1 to 0.6 m/s, got 0.9", ["--to", "walk.csv", "--speed", "0.9"]),
         ("--duration must be 0.02 to 600 s, got 0.0", [*walk, "--duration", "0"]),
         ("--duration must be 0.02 to 600 s, got nan", [*walk, "--duration", "nan"]),

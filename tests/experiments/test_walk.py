@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import shutil
 from pathlib import Path
 
 import jax
@@ -9,18 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.motion.walking.params import PARAM_NAMES
+from creps_jax.motion.robots import NAO, NAO_H25
+from creps_jax.motion.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS, PAPER_BOUNDS, PARAM_NAMES
 from creps_jax.motion.walking.posture import Balance
-from creps_jax.physics import c, mjx
+from creps_jax.physics import c
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.nao_walk import WalkOutcome, nao_walk
 from creps_jax.train import evaluate
-from experiments import fig11_walk, results, runner, walk, walking_policy
+from experiments import fig11_walk, results, runner, tables, walk, walking_policy
 from experiments.cli import main
 from experiments.errors import UserError
-from experiments.policy_file import load_policy, policies_folder
+from experiments.policy_file import load_policy
+from experiments.robots import WALKERS
 from experiments.video import Clip, VideoError
-from experiments.walking_policy import balance_of, load_walking_policy
+from experiments.walking_policy import balance_of, load_walking_policy, robot_of, shipped_policy
+
+SHIPPED = shipped_policy()
 
 
 def stand_in(low, high, *, sample_context, duration, **_) -> Task:
@@ -104,7 +109,7 @@ def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
 
 def test_a_penalised_search_starts_where_a_squashed_one_does():
     settings = dataclasses.replace(walk.SETTINGS["quick"], constraint="penalty")
-    low, high = (np.array(bound) for bound in walk.BOUNDS["nao"])
+    low, high = (np.array(bound) for bound in settings.box())
     start = walk.first_policy(settings)
     np.testing.assert_allclose(start.coef[0], low + (high - low) / (1 + np.exp(0.3)), rtol=1e-5, atol=1e-6)
     # The slope of the sigmoid there, 0.244, times the standard deviation of one before it.
@@ -114,10 +119,13 @@ def test_a_penalised_search_starts_where_a_squashed_one_does():
 
 
 def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
-    monkeypatch.setattr(walking_policy, "policies_folder", lambda: Path("none"))
+    monkeypatch.setattr(walking_policy, "policies_folder", lambda robot: Path("none"))
     Path("bad.npz").write_text("no policy")
     for match, arguments in (
         ("no policy has been learned yet", ["run", "walk", "--speed", "0.3"]),
+        ("yet: python -m experiments run walk --robot nao_h25 --", ["video", "--robot", "nao_h25"]),
+        ("unknown robot 'nao_h26', did you mean 'nao_h25'?", ["run", "walk", "--robot", "nao_h26"]),
+        ("--robot goes with walk, not with fig11_walk", ["run", "fig11_walk", "--robot", "nao_h25"]),
         ("cannot read bad.npz", ["run", "walk", "--speed", "0.3", "--policy", "bad.npz"]),
         ("no such file: none.npz", ["video", "--policy", "none.npz"]),
     ):
@@ -168,7 +176,75 @@ def test_settings_come_back_from_a_manifest():
     assert walk.Settings(**dataclasses.asdict(settings)) == settings
 
 
-@pytest.mark.parametrize(("name", "known"), [("bounds", "nao, paper"), ("physics", "auto, mjx, c")])
+def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monkeypatch, tmp_path):
+    asked = {}
+    monkeypatch.setattr(
+        walk, "nao_walk", lambda *bounds, **settings: asked.update(settings) or stand_in(*bounds, **settings)
+    )
+    np.testing.assert_array_equal(walk.Settings().speeds(), np.float32(tables.PAPER_SPEEDS))
+    assert walk.Settings().box() == NAO_BOUNDS
+    settings = dataclasses.replace(walk.SETTINGS["quick"], robot="nao_h25")
+    assert settings.box() == NAO_H25_BOUNDS
+    assert dataclasses.replace(settings, bounds="paper").box() == PAPER_BOUNDS
+    contexts = jax.vmap(walk.make_task(settings).sample_context)(jax.random.split(jax.random.key(0), 500))
+    assert asked["robot"] is NAO_H25
+    low, high = WALKERS["nao_h25"].low, WALKERS["nao_h25"].high
+    np.testing.assert_allclose([contexts.min(), contexts.max()], [low - 0.02, high + 0.02], atol=5e-3)
+    np.testing.assert_allclose(settings.speeds()[[0, -1]], [low, high], rtol=1e-6)
+    assert not tables.are_the_papers(settings.speeds())
+
+    saved = walk.saved_policy(settings, walk.first_policy(settings))
+    walk.save_policy(tmp_path / "p.npz", saved)
+    assert robot_of(load_walking_policy(tmp_path / "p.npz")) is NAO_H25
+    # Files from before there was a choice are the NAO's.
+    walk.save_policy(
+        tmp_path / "old.npz", dataclasses.replace(saved, task={"balance": saved.task["balance"]})
+    )
+    assert robot_of(load_walking_policy(tmp_path / "old.npz", "nao")) is NAO
+    walk.save_policy(tmp_path / "odd.npz", dataclasses.replace(saved, task={**saved.task, "robot": "pepper"}))
+    with pytest.raises(UserError, match=r"odd\.npz: unknown robot 'pepper', choose from: nao, nao_h25"):
+        load_walking_policy(tmp_path / "odd.npz")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["run", "walk", "--speed", "0.2"], ["video"], ["export", "--to", "w.csv", "--speed", "0.2"]],
+    ids=lambda command: command[0],
+)
+def test_a_policy_of_another_robot_is_refused(bench, capsys, command):
+    settings = walk.SETTINGS["quick"]
+    walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
+    assert main([*command, "--policy", "p.npz", "--robot", "nao_h25"]) == 2
+    assert capsys.readouterr().err == "error: p.npz is a policy of the robot nao, not of nao_h25\n"
+    assert not Path("w.csv").exists() and not bench
+
+
+def test_each_robot_has_its_latest_run(bench):
+    shipped = walking_policy.default_policy("nao_h25")
+    assert shipped == shipped_policy("nao_h25") != walking_policy.default_policy()
+    request = runner.Request("walk", overrides={"robot": "nao_h25"})
+    folder = runner.run(request, console=None, say=lambda _: None)
+    assert walking_policy.default_policy("nao_h25") == folder / "policy.npz"
+    assert walking_policy.default_policy() == walking_policy.default_policy("nao") == SHIPPED
+    kept = results.load_manifest(folder)["settings"]
+    assert (kept["robot"], kept["low"], kept["high"], kept["bounds"]) == ("nao_h25", 0.05, 0.3, "nao_h25")
+    assert kept["physics"] == ("c" if jax.default_backend() == "cpu" else "mjx")
+    # The paper says nothing about it.
+    assert not (folder / "claims.md").exists() and "paper" not in (folder / "table.md").read_text()
+    said = []
+    assert runner.check(("walk",), say=said.append)
+    assert said[0].startswith("walk: no results yet")
+
+
+def test_films_show_six_speeds_of_the_policys_range():
+    nao, h25 = (load_walking_policy(shipped_policy(robot)) for robot in WALKERS)
+    assert walking_policy.filmed_speeds(nao) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    walker = WALKERS["nao_h25"]
+    assert walking_policy.filmed_speeds(h25)[0] == walker.low
+    assert walking_policy.filmed_speeds(h25)[-1] == walker.high
+
+
+@pytest.mark.parametrize(("name", "known"), [("bounds", "nao, nao_h25, paper"), ("physics", "auto, mjx, c")])
 def test_unknown_names_are_refused(name, known):
     with pytest.raises(UserError, match=f"{name} must be one of {known}, got 'moon'"):
         walk.Settings(**{name: "moon"})
@@ -184,19 +260,72 @@ def test_physics_is_what_is_asked_for(monkeypatch, name):
     assert asked["physics"] is walk.PHYSICS[name]
 
 
-@pytest.mark.parametrize(("platform", "module"), [("cpu", c), ("gpu", mjx)])
-def test_the_faster_physics_of_the_machine_are_chosen(monkeypatch, platform, module):
+@pytest.mark.parametrize(("platform", "name"), [("cpu", "c"), ("gpu", "mjx")])
+def test_the_faster_physics_of_the_machine_are_chosen(monkeypatch, platform, name):
     monkeypatch.setattr(jax, "default_backend", lambda: platform)
-    monkeypatch.setattr(module, "make_control_step", lambda model, num_substeps: (model, num_substeps))
+    monkeypatch.setitem(walk.PHYSICS, name, lambda model, num_substeps: (model, num_substeps))
     assert walk.PHYSICS["auto"]("model", 5) == ("model", 5)
+    assert walk.Settings().resolved().physics == name
 
 
+def test_what_is_chosen_where_a_run_starts_is_what_is_meant_there():
+    for settings in (walk.SETTINGS["best"], walk.SETTINGS["paper"], walk.Settings(robot="nao_h25", high=0.2)):
+        resolved = settings.resolved()
+        assert (resolved.context_range(), resolved.box()) == (settings.context_range(), settings.box())
+        assert None not in (resolved.low, resolved.high, resolved.bounds)
+    assert walk.SETTINGS["paper"].resolved().bounds == "paper"
+    asked = walk.Settings(low=0.2, bounds="paper", physics="mjx").resolved()
+    assert (asked.low, asked.high, asked.bounds, asked.physics) == (0.2, 0.6, "paper", "mjx")
+
+
+def unfinished(name, settings):
+    """Leave a folder as an interrupted run does, and return it."""
+    folder = Path("results/walk") / name
+    manifest = results.make_manifest("walk", "quick", walk.SETTINGS["quick"], 0)
+    manifest |= {"settings": settings, "status": "interrupted", "started": name}
+    results.save_json(folder / results.MANIFEST, manifest)
+    return folder
+
+
+def test_resume_finds_the_latest_unfinished_run_of_the_robot(bench):
+    settings = {
+        robot: dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"], robot=robot).resolved())
+        for robot in WALKERS
+    }
+    others = unfinished("1", settings["nao_h25"])
+    ours = unfinished("2", settings["nao"])
+    for robot, folder in ((None, ours), ("nao", ours), ("nao_h25", others)):
+        overrides = {} if robot is None else {"robot": robot}
+        request = runner.Request("walk", overrides=overrides, resume=True)
+        resumed, found, _ = runner._resumed(walk, request)
+        assert found == folder and resumed.robot == (robot or "nao")
+    shutil.rmtree(others)
+    with pytest.raises(UserError, match="no unfinished run of walk with the robot nao_h25 in results"):
+        runner._resumed(walk, runner.Request("walk", overrides={"robot": "nao_h25"}, resume=True))
+
+
+@pytest.mark.parametrize("physics", ["mjx", "auto"])
+def test_a_run_from_before_robots_can_be_resumed(bench, physics):
+    """Its checkpoint has the settings of its manifest, without a robot: they have to be the same still."""
+    settings = dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"].resolved(), physics=physics))
+    del settings["robot"]
+    unfinished("1", settings)
+    resumed, _, manifest = runner._resumed(walk, runner.Request("walk", resume=True))
+    del settings["iterations"]
+    assert runner._identity("walk", resumed, manifest["seed"])["settings"] == settings
+    assert resumed.physics == physics and resumed.robot == "nao"
+
+
+@pytest.mark.parametrize("robot", WALKERS)
 @pytest.mark.usefixtures("relaxed_promotion")
-def test_the_shipped_policy_walks_at_the_asked_speed():
-    policy = load_policy(policies_folder() / "walk.npz")
-    speeds = jnp.array([[0.1], [0.25], [0.45], [0.6]])
+def test_the_shipped_policy_walks_at_the_asked_speed(robot):
+    policy = load_walking_policy(shipped_policy(robot), robot)
+    (low,), (high,) = policy.context_low, policy.context_high
+    assert (low, high) == (WALKERS[robot].low, WALKERS[robot].high)
+    speeds = low + jnp.array([[0.0], [0.3], [0.7], [1.0]]) * (high - low)
     thetas = jnp.stack([jnp.asarray(policy.theta(float(speed))) for (speed,) in speeds])
-    task = nao_walk(duration=4.0, balance=balance_of(policy), physics=c.make_control_step)
+    physics = {"robot": robot_of(policy), "physics": c.make_control_step}
+    task = nao_walk(duration=4.0, balance=balance_of(policy), **physics)
     outcome = evaluate(jax.random.key(0), task, speeds, thetas, repeats=4)
     assert not outcome.fell.any()
     np.testing.assert_allclose(outcome.speed[..., 0].mean(axis=1), speeds[:, 0], atol=0.05)

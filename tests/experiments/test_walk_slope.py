@@ -41,7 +41,7 @@ def settings(tmp_path, monkeypatch):
     clips = [Clip("caption", np.zeros((5, 29)), 0.02)]
     monkeypatch.setattr(walk, "nao_walk", stand_in)
     monkeypatch.setattr(walk_slope, "record", lambda policy, speeds, **_: clips)
-    monkeypatch.setattr(walk_slope, "save_film", lambda clips, path, say: say(f"video: {path}"))
+    monkeypatch.setattr(walk_slope, "save_film", lambda clips, path, say, robot: say(f"video: {path}"))
     monkeypatch.setattr(walk_slope, "SETTINGS", {"quick": settings})
     monkeypatch.chdir(tmp_path)
     return settings
@@ -101,8 +101,8 @@ def test_a_first_policy_of_other_bounds_is_refused(settings):
 
 
 def test_films_show_each_walk_on_its_slope(settings, monkeypatch):
-    def recorded(key, theta, *, values, duration, balance, physics, conditions):
-        del key, theta, balance, physics
+    def recorded(key, theta, *, values, duration, balance, physics, conditions, robot):
+        del key, theta, balance, physics, robot
         assert [condition.name for condition in conditions] == ["slope"]
         time = 0.02 * jnp.arange(1.0, 1 + round(duration / 0.02))
         qpos = jnp.zeros((len(time), 29)).at[:, 0].set(0.1 * values[0] * time)

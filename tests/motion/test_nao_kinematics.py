@@ -15,7 +15,8 @@ from creps_jax.motion.nao_geometry import (
     RIGHT,
     leg_indices,
 )
-from creps_jax.motion.nao_kinematics import MAX_REACH, MIN_REACH, leg_fk, leg_ik
+from creps_jax.motion.nao_kinematics import MAX_REACH, MIN_REACH, leg_fk, leg_ik, leg_reach
+from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.rotations import rigid_transform, rotation_x, rpy_to_matrix
 from tests.oracles import leg_fk_numpy as oracle
 
@@ -188,6 +189,56 @@ def test_reach_is_that_of_the_knee_at_its_limits():
     ankle = oracle.leg_fk(np.zeros(6), LEFT)[:3, 3] + np.array([0.0, 0.0, GEOMETRY.ankle_height])
     np.testing.assert_allclose(MAX_REACH, np.linalg.norm(ankle - HIP_CENTRE), atol=1e-4)
     assert MIN_REACH < 0.1
+
+
+@jax.jit
+def h25_there_and_back(joints, yaw_pitch):
+    """Return the pose of a left leg, and its joints again: freely, with their yaw-pitch, with another."""
+    pose = leg_fk(joints, LEFT, robot=NAO_H25)
+    free, own, shared = (
+        leg_ik(pose, LEFT, robot=NAO_H25, yaw_pitch=given) for given in (None, joints[0], yaw_pitch)
+    )
+    return pose, free, own, shared, leg_fk(shared, LEFT, robot=NAO_H25)
+
+
+@pytest.fixture(scope="module")
+def h25():
+    """Take legs as deep and as wide as a step goes, the knee short of stretched, the sole about level."""
+    random = np.random.default_rng(7)
+    low, high = np.array([[-0.4, -0.3, -0.3, -1.8, -0.3, -0.3], [0.4, 0.3, 1.4, -0.1, 0.3, 0.3]])
+    joints = random.uniform(low, high, (500, 6)).astype(np.float32)
+    joints[:, 4] -= joints[:, 2] + joints[:, 3]
+    shared = random.uniform(-0.3, 0.3, 500).astype(np.float32)
+    return joints, shared, jax.tree.map(np.asarray, jax.vmap(h25_there_and_back)(joints, shared))
+
+
+def test_ik_undoes_fk_for_another_robot_whether_or_not_it_is_told_the_yaw_pitch(h25):
+    joints, _, (_, free, own, _, _) = h25
+    np.testing.assert_allclose(free, joints, atol=1e-4)
+    np.testing.assert_allclose(own, joints, atol=1e-4)
+
+
+def test_a_sole_whose_yaw_pitch_is_given_lies_where_it_was_asked_for_but_for_its_toes(h25):
+    _, given, (asked, _, _, shared, reached) = h25
+    np.testing.assert_allclose(shared[:, 0], given, atol=1e-6)
+    np.testing.assert_allclose(reached[:, :3, 3], asked[:, :3, 3], atol=1e-5)
+    np.testing.assert_allclose(reached[:, :3, 2], asked[:, :3, 2], atol=1e-5)
+    assert np.abs(reached[:, :3, 0] - asked[:, :3, 0]).max() > 0.1
+
+
+def test_a_yaw_pitch_is_given_only_where_the_ankle_axes_meet():
+    with pytest.raises(ValueError, match="yaw_pitch must be None for a robot of ankle_drop above 0, got"):
+        leg_ik(jnp.eye(4), LEFT, yaw_pitch=0.1)
+
+
+def test_reach_is_each_robots_own():
+    assert leg_reach() == leg_reach(NAO) == (MIN_REACH, MAX_REACH)
+    knee = leg_indices(LEFT).start + 3
+    g = NAO_H25.geometry
+    shortest, longest = leg_reach(NAO_H25)
+    bend = NAO_H25.joint_lower[knee]
+    ankle = g.thigh_down + g.shank_down * np.exp(1j * bend)
+    np.testing.assert_allclose([shortest, longest], [abs(ankle), 0.2029], atol=3e-4)
 
 
 def test_indices_select_the_joints_of_a_side():

@@ -7,6 +7,7 @@ import pytest
 
 from creps_jax.motion.nao_geometry import (
     JOINT_LOWER,
+    JOINT_NAMES,
     JOINT_UPPER,
     LEFT,
     MAX_JOINT_SPEED,
@@ -15,6 +16,8 @@ from creps_jax.motion.nao_geometry import (
     leg_indices,
 )
 from creps_jax.motion.nao_kinematics import leg_fk
+from creps_jax.motion.robots import NAO_H25
+from creps_jax.motion.walking.engine import BodyPose, pose_joints
 from creps_jax.motion.walking.params import WalkParams, params_from_theta
 from creps_jax.motion.walking.set_points import next_set_point, open_loop_set_points
 
@@ -57,6 +60,44 @@ def test_joints_turn_as_fast_as_they_can_and_no_faster(walks):
     walking, hasty = np.abs(np.diff(walks[0], axis=1)).max(axis=(1, 2)) / PERIOD
     assert 1.0 < walking <= hasty
     assert hasty == pytest.approx(MAX_JOINT_SPEED, rel=1e-4)
+
+
+@pytest.fixture(scope="module")
+def h25_walks():
+    def walk(theta):
+        return open_loop_set_points(params_from_theta(theta), duration=DURATION, period=PERIOD, robot=NAO_H25)
+
+    return np.asarray(jax.jit(jax.vmap(walk))(jnp.array([WALKING, HASTY])))
+
+
+def test_another_robot_keeps_to_its_own_limits_and_speeds(h25_walks):
+    assert (h25_walks >= np.float32(NAO_H25.joint_lower)).all()
+    assert (h25_walks <= np.float32(NAO_H25.joint_upper)).all()
+    speeds = np.abs(np.diff(h25_walks, axis=1)).max(axis=1) / PERIOD
+    assert (speeds <= np.float32(NAO_H25.max_joint_speed) * 1.0001).all()
+    for joint, largest in (("left_hip_roll", 4.16), ("left_knee", 6.40)):
+        assert speeds[1, JOINT_NAMES.index(joint)] == pytest.approx(largest, rel=1e-4)
+
+
+def test_legs_that_share_a_motor_turn_their_hips_alike(h25_walks):
+    left, right = (h25_walks[..., JOINT_NAMES.index(f"{side}_hip_yaw_pitch")] for side in ("left", "right"))
+    np.testing.assert_allclose(left, right, atol=1e-6)
+    assert np.abs(left[0]).max() > 0
+
+
+def test_legs_that_share_a_motor_keep_their_soles_in_place_at_its_limit():
+    params = params_from_theta(jnp.array(WALKING))
+    toes_in = [jnp.array([0.0, side * 0.05, 0.0, -side]) for side in (LEFT, RIGHT)]
+    pose = BodyPose(jnp.array([0.0, 0.0, 0.21, 0.0]), *toes_in, turn=jnp.float32(0.0))
+    targets = pose_joints(params, pose, jnp.zeros(3), robot=NAO_H25)
+    soles = []
+    for side in (LEFT, RIGHT):
+        leg = leg_indices(side)
+        np.testing.assert_allclose(targets[leg.start], NAO_H25.joint_upper[leg.start], rtol=1e-6)
+        soles.append(np.asarray(leg_fk(targets[leg], side, robot=NAO_H25)))
+    left, right = soles
+    np.testing.assert_allclose(left[:3, 3] - right[:3, 3], [0.0, 0.1, 0.0], atol=1e-5)
+    np.testing.assert_allclose([left[1, 2], right[1, 2]], 0.0, atol=1e-5)
 
 
 def test_a_set_point_reaches_its_target_or_comes_as_near_as_it_can():

@@ -21,6 +21,7 @@ from creps_jax.motion.walking.engine import joint_targets, plan_step, plan_walk,
 from creps_jax.motion.walking.footsteps import FOOT_SPACING, next_footstep, standing
 from creps_jax.motion.walking.params import (
     NAO_BOUNDS,
+    NAO_H25_BOUNDS,
     PAPER_BOUNDS,
     PARAM_LABELS,
     PARAM_NAMES,
@@ -53,7 +54,7 @@ def walk_of(theta, command):
 def test_names_units_and_bounds_belong_together():
     assert WalkParams._fields == PARAM_NAMES
     assert len(PARAM_NAMES) == len(PARAM_UNITS) == len(PARAM_LABELS) == 10
-    for low, high in (NAO_BOUNDS, PAPER_BOUNDS):
+    for low, high in (NAO_BOUNDS, NAO_H25_BOUNDS, PAPER_BOUNDS):
         assert len(low) == len(high) == 10
         assert all(np.array(low) < np.array(high))
 

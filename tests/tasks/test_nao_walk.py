@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from creps_jax.motion.robots import NAO
 from creps_jax.motion.walking.params import params_from_theta
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.motion.walking.set_points import open_loop_set_points
@@ -125,7 +126,7 @@ def test_speed_and_falls_agree_with_c_mujoco(outcome):
 
 def _start_of(theta):
     """Return the position in which a walk begins, without noise."""
-    begin, _ = _make_walker(None, 0.1, WalkNoise(0.0, 0.0, 0.0), Balance(), mjx.make_control_step)
+    begin, _ = _make_walker(NAO, None, 0.1, WalkNoise(0.0, 0.0, 0.0), Balance(), mjx.make_control_step)
     return np.asarray(begin(jax.random.key(0), theta).robot.qpos, float)
 
 

@@ -1,5 +1,6 @@
 """Turn walking parameters into joint targets: plan a step, pose body and joints."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -8,8 +9,9 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.curves import smooth_step
-from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_UPPER, LEFT, RIGHT
+from creps_jax.motion.nao_geometry import LEFT, RIGHT, leg_indices
 from creps_jax.motion.nao_kinematics import leg_ik
+from creps_jax.motion.robots import NAO, Robot
 from creps_jax.motion.walking.com import com_trajectory, spring_height
 from creps_jax.motion.walking.footsteps import Footstep, Stance, next_footstep, standing
 from creps_jax.motion.walking.params import WalkParams
@@ -32,13 +34,6 @@ __all__ = [
 ]
 
 NUM_NODES = 33
-# Height of the CoM above the middle of the hips, m.
-_COM_ABOVE_HIP = 0.025
-# The foot's "centre", where the ZMP is to be, lies ahead of the ankle by this much, m; the CoM is planned
-# above it.
-_CENTRE_AHEAD_OF_ANKLE = 0.02
-# ... and the CoM is ahead of the hips by this much, m.
-_COM_AHEAD_OF_HIP = 0.01
 # Swing of the shoulders against the legs, rad for each metre that the other foot is ahead, and the arms'
 # posture, rad.
 _ARM_SWING = 5.0
@@ -83,33 +78,38 @@ class BodyPose(NamedTuple):
 
 
 @checks.arguments
-def plan_step(params: WalkParams, stance: Stance, command: Float[Array, "3"]) -> tuple[StepPlan, Stance]:
+def plan_step(
+    params: WalkParams, stance: Stance, command: Float[Array, "3"], *, robot: Robot = NAO
+) -> tuple[StepPlan, Stance]:
     """Plan one step: footstep, ZMP reference, CoM trajectory.
 
     Args:
         params: Walking parameters.
         stance: Where the feet stand.
         command: Wanted displacement (x forward, y left, yaw) of the body in one step, m and rad.
+        robot: Who walks.
 
     Returns:
         The plan of the step, and the stance after it.
 
     Source: Abdolmaleki et al. 2016, Section 2.
     """
-    footstep, after = next_footstep(params, stance, command)
+    footstep, after = next_footstep(params, stance, command, robot=robot)
     start, end = stance.body, after.body
     phase = jnp.linspace(0.0, 1.0, NUM_NODES, dtype=command.dtype)
     share = params.double_support / params.step_duration
     zmp = zmp_reference(phase, start[:2], footstep.support[:2], end[:2], share)
     height, height_acc = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
-    com_height = height + (GEOMETRY.ankle_height + _COM_ABOVE_HIP)
+    com_height = height + (robot.geometry.ankle_height + robot.com_above_hip)
     solve = jax.vmap(com_trajectory, in_axes=(1, None, None, 0, 0, None), out_axes=1)
     com = solve(zmp, com_height, height_acc, start[:2], end[:2], params.step_duration)
     return StepPlan(footstep, com, jnp.stack([start[2], end[2]])), after
 
 
 @checks.arguments
-def plan_walk(params: WalkParams, num_steps: int, command: Float[Array, "3"] | None = None) -> StepPlan:
+def plan_walk(
+    params: WalkParams, num_steps: int, command: Float[Array, "3"] | None = None, *, robot: Robot = NAO
+) -> StepPlan:
     """Plan a walk from standstill.
 
     Args:
@@ -117,6 +117,7 @@ def plan_walk(params: WalkParams, num_steps: int, command: Float[Array, "3"] | N
         num_steps: Number of steps.
         command: Wanted displacement of the body in one step; straight ahead by `params.step_length` if
             left out.
+        robot: Who walks.
 
     Returns:
         The plans of the steps, stacked along a leading axis.
@@ -126,20 +127,21 @@ def plan_walk(params: WalkParams, num_steps: int, command: Float[Array, "3"] | N
         command = params.step_length * jnp.array([1.0, 0.0, 0.0], dtype)
 
     def plan_next(stance, _):
-        plan, after = plan_step(params, stance, command)
+        plan, after = plan_step(params, stance, command, robot=robot)
         return after, plan
 
-    return lax.scan(plan_next, standing(dtype), length=num_steps)[1]
+    return lax.scan(plan_next, standing(dtype, robot=robot), length=num_steps)[1]
 
 
 @checks.arguments
-def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
+def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar, *, robot: Robot = NAO) -> BodyPose:
     """Pose hips and feet at one time of a step.
 
     Args:
         params: Walking parameters.
         plan: The plan of the step.
         phase: Time over the duration of the step, 0 to 1.
+        robot: Who walks.
 
     Returns:
         The pose of hips and feet.
@@ -150,7 +152,9 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
     swing, lift = swing_pose(
         plan.footstep.swing_start, plan.footstep.swing_end, params.swing_height, swing_phase
     )
-    swing, support = _above_floor(swing, lift), _above_floor(plan.footstep.support, jnp.zeros_like(lift))
+    back = robot.zmp_ahead_of_ankle
+    swing = _above_floor(swing, lift, back)
+    support = _above_floor(plan.footstep.support, jnp.zeros_like(lift), back)
 
     node = phase * (plan.com.shape[0] - 1)
     index = jnp.minimum(node.astype(jnp.int32), plan.com.shape[0] - 2)
@@ -160,10 +164,10 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar) -> BodyPose:
     turned, swung = smooth_step(phase), smooth_step(jnp.clip(swing_phase, 0.0, 1.0))
     yaw = (1.0 - turned) * plan.yaw[0] + turned * plan.yaw[1]
     forward = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
-    hips = com - _COM_AHEAD_OF_HIP * forward
+    hips = com - robot.com_ahead_of_hip * forward
     supports_left = plan.footstep.supports_left
     return BodyPose(
-        hips=jnp.concatenate([hips, jnp.stack([height + GEOMETRY.ankle_height, yaw])]),
+        hips=jnp.concatenate([hips, jnp.stack([height + robot.geometry.ankle_height, yaw])]),
         left=jnp.where(supports_left, support, swing),
         right=jnp.where(supports_left, swing, support),
         turn=jnp.where(supports_left, 0.5 - swung, swung - 0.5),
@@ -185,16 +189,20 @@ def stand_upright(pose: BodyPose, slope: Scalar) -> BodyPose:
     return pose._replace(hips=pose.hips.at[0].add(ahead))
 
 
-def _above_floor(foot, height):
-    """Place the sole below the ankle, from the planar pose and height of the foot's centre."""
+def _above_floor(foot, height, back):
+    """Place the sole below the ankle, so far behind a foot's centre of this planar pose and height."""
     x, y, yaw = foot
-    back = _CENTRE_AHEAD_OF_ANKLE
     return jnp.stack([x - back * jnp.cos(yaw), y - back * jnp.sin(yaw), height, yaw])
 
 
 @checks.arguments
 def pose_joints(
-    params: WalkParams, pose: BodyPose, measured_rpy: Float[Array, "3"], *, balance: Balance = Balance()
+    params: WalkParams,
+    pose: BodyPose,
+    measured_rpy: Float[Array, "3"],
+    *,
+    balance: Balance = Balance(),
+    robot: Robot = NAO,
 ) -> Float[Array, "22"]:
     """Pose the joints for a body pose and the measured orientation of the trunk.
 
@@ -204,6 +212,7 @@ def pose_joints(
         measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw relative to the planned
             heading's origin.
         balance: How steps answer to the measured orientation.
+        robot: Who walks.
 
     Returns:
         Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad, within the joint limits.
@@ -221,23 +230,41 @@ def pose_joints(
     tilt = jnp.clip(measured_rpy[0], -_MAX_TILT, _MAX_TILT)
     aside = -balance.placement_gain * params.hip_height * tilt
     aside_left, aside_right = aside * (0.5 + pose.turn), aside * (0.5 - pose.turn)
-    left = leg_ik(_sole_in_torso(pose.hips, pose.left, R_level_trunk, turn, aside_left), LEFT)
-    right = leg_ik(_sole_in_torso(pose.hips, pose.right, R_level_trunk, -turn, aside_right), RIGHT)
+    place = partial(_sole_in_torso, pose.hips, R_level_trunk=R_level_trunk, geometry=robot.geometry)
+    left, right = _pose_legs(
+        place(pose.left, turn=turn, aside=aside_left), place(pose.right, turn=-turn, aside=aside_right), robot
+    )
     ahead = jnp.cos(pose.hips[3]) * (pose.left[0] - pose.right[0]) + jnp.sin(pose.hips[3]) * (
         pose.left[1] - pose.right[1]
     )
     targets = jnp.concatenate([_head_and_arms(0.5 * ahead), left, right])
-    return jnp.clip(targets, jnp.asarray(JOINT_LOWER, targets.dtype), jnp.asarray(JOINT_UPPER, targets.dtype))
+    limits = (jnp.asarray(limit, targets.dtype) for limit in (robot.joint_lower, robot.joint_upper))
+    return jnp.clip(targets, *limits)
 
 
-def _sole_in_torso(hips, sole, R_level_trunk, turn, aside):
+def _pose_legs(T_torso_left, T_torso_right, robot):
+    """Return the joint angles of both legs; where they share a motor, each gives half of the way."""
+    left, right = leg_ik(T_torso_left, LEFT, robot=robot), leg_ik(T_torso_right, RIGHT, robot=robot)
+    if not robot.has_one_yaw_motor:
+        return left, right
+    yaws = [leg_indices(side).start for side in (LEFT, RIGHT)]
+    low, high = max(robot.joint_lower[i] for i in yaws), min(robot.joint_upper[i] for i in yaws)
+    # Within what the joint can do: clipped after `leg_ik`, it would take the soles from their places.
+    shared = jnp.clip(0.5 * (left[0] + right[0]), low, high)
+    return (
+        leg_ik(T_torso_left, LEFT, robot=robot, yaw_pitch=shared),
+        leg_ik(T_torso_right, RIGHT, robot=robot, yaw_pitch=shared),
+    )
+
+
+def _sole_in_torso(hips, sole, *, R_level_trunk, turn, aside, geometry):
     """Transform a sole from the world into the frame of a trunk that leans about the middle of its hips.
 
     The sole is turned by `turn` about the hips and put `aside` to the left.
     """
     R_trunk_level = R_level_trunk.T
     R_heading = rotation_z(turn - hips[3])
-    hip_centre = jnp.array([GEOMETRY.hip_x, 0.0, GEOMETRY.hip_z], hips.dtype)
+    hip_centre = jnp.array([geometry.hip_x, 0.0, geometry.hip_z], hips.dtype)
     from_hips = R_heading @ (sole[:3] - hips[:3]) + aside * jnp.array([0.0, 1.0, 0.0], hips.dtype)
     position = R_trunk_level @ from_hips + hip_centre
     return rigid_transform(R_trunk_level @ R_heading @ rotation_z(sole[3]), position)
@@ -259,6 +286,7 @@ def joint_targets(
     measured_rpy: Float[Array, "3"],
     *,
     balance: Balance = Balance(),
+    robot: Robot = NAO,
 ) -> Float[Array, "22"]:
     """Return the joint targets of a planned walk at a time.
 
@@ -268,18 +296,20 @@ def joint_targets(
         time: Time since the start of the first step, s; after the last step the robot holds its last pose.
         measured_rpy: Measured roll, pitch and yaw of the trunk, rad.
         balance: See `pose_joints`.
+        robot: Who walks.
 
     Returns:
         Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad.
     """
-    return pose_joints(params, pose_at(params, plans, time), measured_rpy, balance=balance)
+    pose = pose_at(params, plans, time, robot=robot)
+    return pose_joints(params, pose, measured_rpy, balance=balance, robot=robot)
 
 
 @checks.arguments
-def pose_at(params: WalkParams, plans: StepPlan, time: Scalar) -> BodyPose:
+def pose_at(params: WalkParams, plans: StepPlan, time: Scalar, *, robot: Robot = NAO) -> BodyPose:
     """Return the body pose of a planned walk at a time (see `joint_targets`)."""
     num_steps = plans.yaw.shape[0]
     steps = time / params.step_duration
     index = jnp.clip(jnp.floor(steps), 0.0, num_steps - 1.0)
     plan = jax.tree.map(lambda leaf: leaf[index.astype(jnp.int32)], plans)
-    return body_pose(params, plan, steps - index)
+    return body_pose(params, plan, steps - index, robot=robot)

@@ -11,6 +11,7 @@ from creps_jax.typing import Array, Float, Scalar
 __all__ = [
     "GRAVITY",
     "NAO_BOUNDS",
+    "NAO_H25_BOUNDS",
     "PAPER_BOUNDS",
     "PARAM_LABELS",
     "PARAM_NAMES",
@@ -66,6 +67,12 @@ NAO_BOUNDS = (
 )
 """Bounds in which a NAO can walk at all: part of `PAPER_BOUNDS`, with room for slow walking (step length from
 0) and leaning back."""
+
+NAO_H25_BOUNDS = (
+    (0.0, 0.15, 0.015, 0.18, -5.0, 0.0, 0.0, 0.0, 0.0, 0.02),
+    (0.01, 0.19, 0.05, 0.40, 5.0, 1.0, 1.0, 0.10, 0.1, 0.2),
+)
+"""Bounds in which the real NAO, whose legs are shorter and weaker, can walk."""
 
 _SHORTEST_STEP = 0.08
 # What the engine accepts, whatever theta says. Within it every plan is finite.
