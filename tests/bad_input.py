@@ -742,7 +742,7 @@ def test_bad_input_is_named_or_borne(name, argument):
     good, expected = good_call(name)
 
     @settings(
-        max_examples=NUM_EXAMPLES or 5,
+        max_examples=NUM_EXAMPLES or 4,
         deadline=None,
         derandomize=not NUM_EXAMPLES,
         database=None,

@@ -55,9 +55,10 @@ def few_compiled_programs():
 
 @pytest.fixture(scope="module")
 def compiled_as_for_users():
-    """Compile a file's programs with all optimisations, where these matter."""
+    """Compile with all optimisations: from the first test of a file that asks for it on."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", False)
+    jax.clear_caches()
     yield
     jax.config.update("jax_disable_most_optimizations", before)
 

@@ -14,8 +14,6 @@ from tests.oracles import dual_scipy
 
 NUM = 200
 NUM_FEATURES = 5
-# The last digits decide how rewards far out of reach are solved.
-pytestmark = pytest.mark.usefixtures("compiled_as_for_users")
 
 
 TRACES = []
@@ -243,21 +241,6 @@ def test_mask_equals_subset():
     assert np.all(weights[~valid] == 0)
 
 
-def test_vmap_equals_loop():
-    batches = [samples(seed) for seed in range(4)]
-    reward = jnp.stack([jnp.float32(batch[2]) for batch in batches])
-    features = jnp.stack([jnp.float32(batch[1]) for batch in batches])
-    valid = jnp.ones(reward.shape, bool)
-    bounds = jnp.float32([0.1, 0.5, 1.0, 50.0])
-    solutions, weights = jax.jit(jax.vmap(solve))(reward, features, valid, bounds)
-    for i in range(4):
-        alone, alone_weights = solve(reward[i], features[i], valid[i], bounds[i])
-        assert bool(solutions.is_active[i]) == bool(alone.is_active) == (i < 3)
-        rounding = 1e-3 if i < 3 else 0.1  # of the relative entropy of greedy weights, which sets the last
-        np.testing.assert_allclose(solutions.temperature[i], alone.temperature, rtol=rounding)
-        np.testing.assert_allclose(weights[i], alone_weights, atol=rounding / 10)
-
-
 def test_traced_once():
     _, features, reward = samples()
     solve_all(reward, features)
@@ -447,3 +430,19 @@ def test_the_scale_of_a_prior_does_not_matter(key, scale):
     expected = solve_dual(reward, features, kl_bound=0.5)
     found = solve_dual(reward, features, jnp.full(NUM, scale), kl_bound=0.5)
     np.testing.assert_allclose(found.temperature, expected.temperature, rtol=1e-4)
+
+
+@pytest.mark.usefixtures("compiled_as_for_users")
+def test_vmap_equals_loop():
+    batches = [samples(seed) for seed in range(4)]
+    reward = jnp.stack([jnp.float32(batch[2]) for batch in batches])
+    features = jnp.stack([jnp.float32(batch[1]) for batch in batches])
+    valid = jnp.ones(reward.shape, bool)
+    bounds = jnp.float32([0.1, 0.5, 1.0, 50.0])
+    solutions, weights = jax.jit(jax.vmap(solve))(reward, features, valid, bounds)
+    for i in range(4):
+        alone, alone_weights = solve(reward[i], features[i], valid[i], bounds[i])
+        assert bool(solutions.is_active[i]) == bool(alone.is_active) == (i < 3)
+        rounding = 1e-3 if i < 3 else 0.1  # of the relative entropy of greedy weights, which sets the last
+        np.testing.assert_allclose(solutions.temperature[i], alone.temperature, rtol=rounding)
+        np.testing.assert_allclose(weights[i], alone_weights, atol=rounding / 10)
