@@ -181,7 +181,7 @@ def array(name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, 
         ValueError: If they are no real numbers, or have another shape.
     """
     try:
-        result = value if isinstance(value, jax.Array) else jnp.asarray(value)
+        result = value if isinstance(value, jax.Array) else jnp.asarray(_by_numpy(value))
     except (TypeError, ValueError, OverflowError):
         result = None
     if result is None or not _is_real(result):
@@ -298,6 +298,14 @@ def _checked_array(name: str, value: Any, axes: list[str], arrays: _Arrays) -> A
     result = array(name, value, shape, note=note)
     arrays[name] = [axis if axis.isalpha() else "" for axis in axes], result.shape
     return result
+
+
+def _by_numpy(value: Any) -> Any:
+    """Return what NumPy can take as an array of NumPy; jax takes letters in a list for types."""
+    try:
+        return np.asarray(value)
+    except (TypeError, ValueError):  # traced, or ragged
+        return value
 
 
 def _limits(least: float, above: float, largest: float = FLOAT32_MAX) -> str:

@@ -95,10 +95,14 @@ class SavedPolicy:
         Raises:
             UserError: if there are more or fewer, or one is outside the range that was learned.
         """
-        if len(context) != len(self.context_names):
+        try:
+            numbers = tuple(float(value) for value in context)
+        except (TypeError, ValueError):
+            numbers = ()
+        if len(numbers) != len(self.context_names):
             raise UserError(f"expected a number for each of {', '.join(self.context_names)}, got {context}")
         for value, name, unit, low, high in zip(
-            context, self.context_names, self.context_units, self.context_low, self.context_high, strict=True
+            numbers, self.context_names, self.context_units, self.context_low, self.context_high, strict=True
         ):
             # Ends that went through single precision belong to the range.
             slack = 1e-6 * (high - low)
@@ -106,7 +110,7 @@ class SavedPolicy:
                 raise UserError(
                     f"{name} must be within the learned range, {low:g} to {high:g} {unit}, got {value}"
                 )
-        features = self.feature_map().apply(jnp.array(context, jnp.float32))
+        features = self.feature_map().apply(jnp.array(numbers, jnp.float32))
         return np.asarray(features) @ np.asarray(self.coef)
 
     def theta(self, *context: float) -> np.ndarray:

@@ -66,6 +66,12 @@ def test_a_context_outside_the_learned_range_is_refused(context):
         make_policy().theta(context)
 
 
+@pytest.mark.parametrize("context", ["fast", None, [0.1, 0.2]])
+def test_a_context_that_is_no_number_is_refused(context):
+    with pytest.raises(UserError, match="expected a number for each of speed, got"):
+        make_policy().theta(context)
+
+
 def test_several_context_variables_each_have_a_range():
     policy = make_policy(
         context_names=("speed", "slope"),
