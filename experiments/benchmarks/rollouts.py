@@ -26,7 +26,8 @@ import numpy as np  # noqa: E402
 from jax.experimental import io_callback  # noqa: E402
 
 from creps_jax.physics import c, mjx  # noqa: E402
-from creps_jax.physics.state import ControlStep  # noqa: E402
+from creps_jax.physics.servos import read_servos  # noqa: E402
+from creps_jax.physics.state import ControlStep, substep_shares  # noqa: E402
 from creps_jax.tasks import Task  # noqa: E402
 from creps_jax.tasks.nao_walk import CONTROL_PERIOD, Physics, load_nao, nao_walk, record_walk  # noqa: E402
 from creps_jax.train import evaluate  # noqa: E402
@@ -92,9 +93,8 @@ def _bare_c(model: mujoco.MjModel, threads: int) -> Callable[[], None]:
     start, told = _told()
     data = [mujoco.MjData(model) for _ in range(threads)]
     states = np.concatenate([np.zeros((BATCH, 1)), start, np.zeros((BATCH, model.nv))], axis=1)
-    substeps = round(CONTROL_PERIOD / model.opt.timestep)
-    shares = np.arange(1, substeps + 1)[:, None] / substeps
-    lead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0]
+    lead = read_servos(model).lead
+    shares = substep_shares(round(CONTROL_PERIOD / model.opt.timestep))[:, None]
     before, after, speed = np.split(told[:, :, None], 3, axis=-1)
     controls = (before + shares * (after - before) + lead * speed).reshape(BATCH, -1, model.nu)
 
