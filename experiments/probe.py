@@ -63,11 +63,11 @@ class Probe:
 
         def step(qpos, qvel, warmstart, before, after, speed):
             data.qpos, data.qvel, data.qacc_warmstart = qpos, qvel, warmstart
-            for share in shares:
-                set_point = before + share * (after - before)
-                data.ctrl = set_point + servos.lead * speed
+            lead = servos.lead * speed
+            for control in servos.controls(shares, before, after, speed):
+                data.ctrl = control
                 mujoco.mj_step(model, data)
-                self._rows.append(_measure(model, data, np.array(set_point)))
+                self._rows.append(_measure(model, data, np.array(control - lead)))
             return [np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
 
         def control_step(state, before, after, speed):

@@ -4,12 +4,14 @@ import contextlib
 import copy
 import operator
 import os
-from typing import NamedTuple
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax import lax
+from jax.experimental.buffer_callback import buffer_callback
 from mujoco import rollout
 
 from creps_jax import checks
@@ -43,53 +45,63 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     Raises:
         ValueError: If an actuator is no plain position servo on a joint, or there is no substep.
     """
-    shares = substep_shares(num_substeps)[:, None]
-    lead = read_servos(model).lead
+    shares = substep_shares(num_substeps)
+    servos = read_servos(model)
     # Devices call at the same time, each from threads that come and go.
     idle = []
-
-    def make():
-        data = [mujoco.MjData(model) for _ in range(_threads())]
-        # Without a thread of its own, a pool works in the one that calls.
-        return _Tools(rollout.Rollout(nthread=len(data) if len(data) > 1 else 0), data, [])
-
     world_sizes = tuple(np.size(leaf) for leaf in world_of(model))
-    sizes = (model.nq, model.nv, model.nv, model.nu, model.nu, model.nu)
+    # A row is a robot: its state, what its servos are told in each physics step, and the world it is in.
+    sizes = (model.nq + model.nv, model.nv, num_substeps * model.nu)
 
-    def step_batch(packed):
-        rows = np.array(packed, float).reshape(-1, packed.shape[-1])
-        qpos, qvel, warmstart, before, after, speed, worlds = np.split(rows, np.cumsum(sizes), axis=1)
-        control = before[:, None] + shares * (after - before)[:, None] + (lead * speed)[:, None]
-        start = np.concatenate([np.zeros((len(qpos), 1)), qpos, qvel], axis=1)
-        moved = np.full((len(rows), sum(sizes[:3])), np.nan, np.float32)
-        is_sound = (np.abs(start) <= _LARGEST).all(axis=1) & np.isfinite(control).all(axis=(1, 2))
-        if not is_sound.any():
-            return moved.reshape(*packed.shape[:-1], -1)
-        start, control, warmstart, qvel, worlds = (
-            array[is_sound] for array in (start, control, warmstart, qvel, worlds)
+    def step_batch(packed: np.ndarray, moved: np.ndarray) -> None:
+        rows, moved = packed.reshape(-1, packed.shape[-1]), moved.reshape(-1, moved.shape[-1])
+        with _borrowed(idle, lambda: _Tools(model, num_substeps)) as tools:
+            if np.abs(rows).max() <= _LARGEST:
+                step_rows(tools, rows, moved)
+                return
+            moved[:] = np.nan
+            is_sound = (np.abs(rows[:, : sizes[0]]) <= _LARGEST).all(axis=1)
+            is_sound &= np.isfinite(rows[:, sizes[0] : sum(sizes)]).all(axis=1)
+            if is_sound.any():
+                some = moved[is_sound]
+                step_rows(tools, rows[is_sound], some)
+                moved[is_sound] = some
+
+    def step_rows(tools: _Tools, rows: np.ndarray, moved: np.ndarray) -> None:
+        num = len(rows)
+        start, warmstart, control, states = tools.arrays(num)
+        state, warm, told, worlds = np.split(rows, np.cumsum(sizes), axis=1)
+        start[:, 1:], warmstart[:], control.reshape(num, -1)[:] = state, warm, told
+        tools.pool.rollout(
+            _models(model, tools.copies, worlds, world_sizes) if worlds.size else [model] * num,
+            tools.data,
+            start,
+            control,
+            skip_checks=True,
+            nstep=num_substeps,
+            initial_warmstart=warmstart,
+            state=states,
         )
-        with _borrowed(idle, make) as (pool, data, copies):
-            models = _models(model, copies, worlds, world_sizes) if worlds.size else [model] * len(start)
-            states = np.empty((len(start), num_substeps, start.shape[1]))
-            pool.rollout(
-                models,
-                data,
-                start,
-                control,
-                skip_checks=True,
-                nstep=num_substeps,
-                initial_warmstart=warmstart,
-                state=states,
-            )
-        # C stands a robot up again whose state has become bad, with a new time, and leaves it there.
-        is_lost = states[:, -1, 0] < (num_substeps - 0.5) * model.opt.timestep
-        is_lost |= ~(np.abs(states[:, -1]) <= _LARGEST).all(axis=1)
-        states[is_lost] = np.nan
-        end = states[:, -1, 1 + model.nq :]
+        end, speeds = states[:, -1], states[:, :, 1 + model.nq :]
+        moved[:, : sizes[0]] = end[:, 1:]
         # The solver starts near the last acceleration; what the velocities tell of it is a good guess.
-        earlier = states[:, -2, 1 + model.nq :] if num_substeps > 1 else qvel
-        moved[is_sound] = np.concatenate([states[:, -1, 1:], (end - earlier) / model.opt.timestep], axis=1)
-        return moved.reshape(*packed.shape[:-1], -1)
+        earlier = speeds[:, -2] if num_substeps > 1 else start[:, 1 + model.nq :]
+        np.subtract(speeds[:, -1], earlier, out=warmstart)
+        np.divide(warmstart, model.opt.timestep, out=moved[:, sizes[0] :], casting="same_kind")
+        # C stands a robot up again whose state has become bad, with a new time, and leaves it there.
+        is_lost = end[:, 0] < (num_substeps - 0.5) * model.opt.timestep
+        is_lost |= ~(np.abs(end).max(axis=1) <= _LARGEST)
+        if is_lost.any():
+            moved[is_lost] = np.nan
+
+    def step_buffers(context, moved, packed):
+        del context
+        step_batch(np.asarray(packed), np.asarray(moved))
+
+    def step_array(packed):
+        moved = np.empty((*packed.shape[:-1], sum(sizes[:2])), np.float32)
+        step_batch(np.asarray(packed), moved)
+        return moved
 
     def control_step(
         state: RobotState,
@@ -100,21 +112,39 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     ) -> RobotState:
         # One array each way: handing over many costs more than what is in them.
         leaves = () if world is None else (jnp.ravel(jnp.asarray(leaf, jnp.float32)) for leaf in world)
-        packed = jnp.concatenate([*state, before, after, speed, *leaves])
-        shape = jax.ShapeDtypeStruct((sum(sizes[:3]),), jnp.float32)
-        moved = jax.pure_callback(step_batch, shape, packed, vmap_method="broadcast_all")
-        return RobotState(*jnp.split(moved, np.cumsum(sizes[:2])))
+        controls = servos.controls(shares.astype(before.dtype), before, after, speed)
+        packed = jnp.concatenate([*state, controls.ravel(), *leaves])
+        shape = jax.ShapeDtypeStruct((sum(sizes[:2]),), jnp.float32)
+        # Not `jax.pure_callback` on a CPU: that copies large arguments by jax. Where all devices do so at
+        # once, none has a thread left to copy with, and all wait for ever.
+        moved = lax.platform_dependent(
+            packed,
+            cpu=buffer_callback(step_buffers, shape, vmap_method="broadcast_all"),
+            default=partial(jax.pure_callback, step_array, shape, vmap_method="broadcast_all"),
+        )
+        return RobotState(*jnp.split(moved, np.cumsum([model.nq, model.nv])))
 
     return control_step
 
 
-class _Tools(NamedTuple):
-    """What one call works with."""
+class _Tools:
+    """What one call works with: threads, their data, models and arrays, made once."""
 
-    pool: rollout.Rollout
-    data: list[mujoco.MjData]
-    copies: list[mujoco.MjModel]
-    """Models for robots in worlds of their own, as many as a call needed so far."""
+    def __init__(self, model: mujoco.MjModel, num_substeps: int) -> None:
+        self.data = [mujoco.MjData(model) for _ in range(_threads())]
+        # Without a thread of its own, a pool works in the one that calls.
+        self.pool = rollout.Rollout(nthread=len(self.data) if len(self.data) > 1 else 0)
+        # Models for robots in worlds of their own, as many as a call needed so far.
+        self.copies: list[mujoco.MjModel] = []
+        size = 1 + model.nq + model.nv
+        self._shapes = ((size,), (model.nv,), (num_substeps, model.nu), (num_substeps, size))
+        self._arrays = [np.zeros((0, *shape)) for shape in self._shapes]
+
+    def arrays(self, num: int) -> list[np.ndarray]:
+        """Return arrays for so many robots' first states, accelerations, controls and states."""
+        if num > len(self._arrays[0]):
+            self._arrays = [np.zeros((num, *shape)) for shape in self._shapes]
+        return [array[:num] for array in self._arrays]
 
 
 def _models(model, copies, worlds, sizes):

@@ -41,7 +41,8 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
             or there is no substep.
     """
     shares = substep_shares(num_substeps)
-    step = _make_step(model)
+    servos = read_servos(model)
+    step = _make_step(model, servos)
     device_model = mjx.put_model(model)
 
     def control_step(
@@ -56,21 +57,21 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
             # Of NumPy arrays MJX would ask that they are the same for all bodies.
             here = here.tree_replace(jax.tree.map(jnp.asarray, changed_fields(model, world)))
 
-        def substep(state, share):
-            return step(here, state, before + share * (after - before), speed), None
+        def substep(state, control):
+            return step(here, state, control), None
 
-        return lax.scan(substep, state, jnp.asarray(shares, before.dtype))[0]
+        controls = servos.controls(shares.astype(before.dtype), before, after, speed)
+        return lax.scan(substep, state, controls)[0]
 
     return control_step
 
 
-def _make_step(model: mujoco.MjModel) -> Callable[[mjx.Model, RobotState, Array, Array], RobotState]:
-    """Return `mj_step` for (model, state, set-points, their speeds), put together from the stages of MJX.
+def _make_step(model: mujoco.MjModel, servos: Servos) -> Callable[[mjx.Model, RobotState, Array], RobotState]:
+    """Return `mj_step` for (model, state, what the servos are told), put together from the stages of MJX.
 
     `mjx.step` has stages that do nothing for a robot with plain servos and nothing else that acts on it, but
     take time: Jacobians of all bodies for forces from outside, and matrices of moments for the actuators.
     """
-    servos = read_servos(model)
     for name, found, expected in (
         ("integrator", model.opt.integrator, mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
         ("solver", model.opt.solver, mujoco.mjtSolver.mjSOL_NEWTON),
@@ -84,11 +85,11 @@ def _make_step(model: mujoco.MjModel) -> Callable[[mjx.Model, RobotState, Array,
     blank = mjx.make_data(model)
     timestep = float(model.opt.timestep)
 
-    def step(device_model: mjx.Model, state: RobotState, set_point: Array, speed: Array) -> RobotState:
+    def step(device_model: mjx.Model, state: RobotState, control: Array) -> RobotState:
         data = blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart)
         for stage in _POSITION_STAGES + _VELOCITY_STAGES:
             data = stage(device_model, data)
-        torque, damping = _act(servos, data, set_point, speed)
+        torque, damping = _act(servos, data, control)
         inertia = mjx.full_m(device_model, data)
         qfrc_smooth = data.qfrc_passive - data.qfrc_bias + torque
         qacc_smooth = cho_solve(cho_factor(inertia, lower=True), qfrc_smooth)
@@ -103,9 +104,9 @@ def _make_step(model: mujoco.MjModel) -> Callable[[mjx.Model, RobotState, Array,
     return step
 
 
-def _act(servos: Servos, data: mjx.Data, set_point: Array, speed: Array) -> tuple[Array, Array]:
+def _act(servos: Servos, data: mjx.Data, control: Array) -> tuple[Array, Array]:
     """Return torques and damping coefficients of the servos, one for each degree of freedom."""
-    control = jnp.clip(set_point + servos.lead * speed, *servos.control_range)
+    control = jnp.clip(control, *servos.control_range)
     wanted = servos.stiffness * (control - data.qpos[servos.qpos_index])
     wanted = wanted - servos.damping * data.qvel[servos.qvel_index]
     torque = jnp.clip(wanted, *servos.torque_range)

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from creps_jax import checks
-from creps_jax.typing import Float, Int
+from creps_jax.typing import Array, Float, Int
 
 __all__ = ["Servos", "read_servos"]
 
@@ -34,6 +34,24 @@ class Servos(NamedTuple):
     def lead(self) -> Float[np.ndarray, " nu"]:
         """How far ahead of a moving set-point its damping costs a servo nothing, s."""
         return self.damping / self.stiffness
+
+    def controls(
+        self,
+        shares: Float[np.ndarray, " n"],
+        before: Float[Array | np.ndarray, "*b nu"],
+        after: Float[Array | np.ndarray, "*b nu"],
+        speed: Float[Array | np.ndarray, "*b nu"],
+    ) -> Float[Array | np.ndarray, "*b n nu"]:
+        """Return what the servos are told in each physics step of a control step, rad.
+
+        Args:
+            shares: What `physics.state.substep_shares` gives for the number of steps.
+            before: Set-points at the start of the control step, rad.
+            after: Set-points at its end, rad.
+            speed: The set-points' speed, rad/s.
+        """
+        first, way, ahead = (x[..., None, :] for x in (before, after - before, self.lead * speed))
+        return first + shares[:, None] * way + ahead
 
 
 @checks.arguments

@@ -11,6 +11,7 @@ import pytest
 from creps_jax.physics import c, mjx
 from creps_jax.physics.state import initial_state
 from creps_jax.physics.world import World
+from creps_jax.rollouts import share_rows
 from creps_jax.tasks.nao_walk import load_nao
 from tests.oracles.walk_c import servo_step
 
@@ -179,3 +180,19 @@ def test_c_steps_a_batch_of_any_shape_from_any_state(model, tmp_path, monkeypatc
     one_row = jax.tree.map(lambda x: x[0], states)
     moved = jax.jit(jax.vmap(control_step))(one_row, commands, commands, commands)
     assert jnp.isnan(moved.qpos).all(axis=1).tolist() == [False, True, False]
+
+
+def test_devices_step_large_batches_by_c_at_the_same_time():
+    # Through `jax.pure_callback` this waits for ever on jax 0.9.
+    model = mujoco.MjModel.from_xml_string(HINGE.format(option="", actuator='<position joint="hinge"/>'))
+    control_step = c.make_control_step(model, 1)
+    still = jnp.zeros(1)
+
+    def swing(angle):
+        start = initial_state(angle, 1)
+        return jax.lax.fori_loop(0, 20, lambda _, state: control_step(state, still, still, still), start).qpos
+
+    assert len(jax.devices()) == 2
+    ends = jax.jit(share_rows(jax.vmap(swing), tuple(jax.devices())))(jnp.full((20_000, 1), 0.1))
+    assert np.unique(ends).size == 1
+    np.testing.assert_allclose(ends[0], swing(jnp.full(1, 0.1)))
