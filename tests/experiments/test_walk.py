@@ -89,6 +89,7 @@ def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
     key = jax.random.key(0)
     arrays = fig11_walk.run(settings, key)
     for name in fig11_walk.CONTENDERS:
+        assert arrays[f"{name}.episodes"].shape == (2,)
         assert arrays[f"{name}.sample_reward"].shape == (2, 2)
         assert arrays[f"{name}.reward"].shape == (2, 11, 3)
     # The same samples but for how they are kept within bounds and what features round.
