@@ -26,6 +26,7 @@ def test_there_are_notebooks():
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path, monkeypatch, tmp_path):
     monkeypatch.setitem(os.environ, "FIRST_WALK_SECONDS", "3")
+    monkeypatch.setitem(os.environ, "HOLE_ITERATIONS", "50")
     notebook = nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
 
