@@ -11,6 +11,8 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+# The pages of the documents, which are built along with every run of all tests, execute the others, too.
+QUICK = ("first_policy", "first_walk")
 
 
 def test_readme_example_runs():
@@ -23,7 +25,13 @@ def test_there_are_notebooks():
     assert NOTEBOOKS
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.stem, marks=() if path.stem in QUICK else pytest.mark.slow)
+        for path in NOTEBOOKS
+    ],
+)
 def test_notebook_runs(path, monkeypatch, tmp_path):
     monkeypatch.setitem(os.environ, "FIRST_WALK_SECONDS", "3")
     monkeypatch.setitem(os.environ, "HOLE_ITERATIONS", "50")
