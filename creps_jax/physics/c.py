@@ -56,7 +56,7 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     def step_batch(packed: np.ndarray, moved: np.ndarray) -> None:
         rows, moved = packed.reshape(-1, packed.shape[-1]), moved.reshape(-1, moved.shape[-1])
         with _borrowed(idle, lambda: _Tools(model, num_substeps)) as tools:
-            if np.abs(rows).max() <= _LARGEST:
+            if len(rows) and np.abs(rows).max() <= _LARGEST:
                 step_rows(tools, rows, moved)
                 return
             moved[:] = np.nan

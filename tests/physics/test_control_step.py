@@ -168,6 +168,8 @@ def test_c_steps_a_batch_of_any_shape_from_any_state(model, tmp_path, monkeypatc
     moved = jax.jit(batch)(states, still, still, still)
     assert moved.qpos.shape == (2, 3, model.nq)
     np.testing.assert_array_equal(moved.qpos[1, 2], alone.qpos)
+    nobody = jax.tree.map(lambda x: x[:0], states)
+    assert jax.jit(batch)(nobody, still, still, still).qpos.shape == (0, 3, model.nq)
     # One robot that is lost does not take the others with it.
     lost = states._replace(qpos=states.qpos.at[0, 0].set(jnp.nan))
     moved = jax.jit(batch)(lost, still, still, still)
