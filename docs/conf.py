@@ -41,6 +41,8 @@ nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600
 nb_merge_streams = True
+# A notebook that complains fails the build.
+nb_output_stderr = "error"
 
 html_theme_options = {
     "description": "Contextual policy search for robots, in JAX",

@@ -174,7 +174,9 @@ def signed_rank_p(gains: np.ndarray) -> float:
     return float(stats.wilcoxon(gains, alternative="greater").pvalue) if gains.any() else 1.0
 
 
-def share_of_episodes(episodes: np.ndarray, curve: np.ndarray, reference: np.ndarray) -> float:
+def share_of_episodes(
+    episodes: np.ndarray, curve: np.ndarray, reference: np.ndarray, *, total: float | None = None
+) -> float:
     """Return in which share of the episodes a curve gets as far as another does in all of them.
 
     Both by the median of the trials; infinite if it never does.
@@ -182,10 +184,12 @@ def share_of_episodes(episodes: np.ndarray, curve: np.ndarray, reference: np.nda
     Args:
         episodes: (k,) rollouts so far.
         curve: (trials, k) rewards.
-        reference: (trials, k) rewards of the other.
+        reference: (trials, j) rewards of the other.
+        total: rollouts of the other after all, if not `episodes[-1]`.
     """
     is_there = np.median(curve, axis=0) >= np.median(reference[:, -1])
-    return float(episodes[is_there][0] / episodes[-1]) if is_there.any() else math.inf
+    total = episodes[-1] if total is None else total
+    return float(episodes[is_there][0] / total) if is_there.any() else math.inf
 
 
 def mean_thetas(contender: Contender, coef: np.ndarray | jax.Array, contexts: jax.Array) -> jax.Array:

@@ -63,11 +63,13 @@ class Probe:
 
         def step(qpos, qvel, warmstart, before, after, speed):
             data.qpos, data.qvel, data.qacc_warmstart = qpos, qvel, warmstart
-            lead = servos.lead * speed
+            # Plain arrays: jax must not wait for jax within a callback.
+            before, after, speed = (np.asarray(x) for x in (before, after, speed))
+            ahead = servos.lead * speed
             for control in servos.controls(shares, before, after, speed):
                 data.ctrl = control
                 mujoco.mj_step(model, data)
-                self._rows.append(_measure(model, data, np.array(control - lead)))
+                self._rows.append(_measure(model, data, np.asarray(control - ahead)))
             return [np.float32(x) for x in (data.qpos, data.qvel, data.qacc_warmstart)]
 
         def control_step(state, before, after, speed):

@@ -13,8 +13,8 @@ os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
 if version("jaxlib").startswith("0.9."):
-    # Without its new code generator jaxlib compiles in half the time. It ends the process where it does not
-    # know a flag, as later versions do this one.
+    # Without the new code generator, which users have, jaxlib compiles in half the time. It ends the process
+    # where it does not know a flag, as later versions do this one.
     os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}"
 prepare()
 

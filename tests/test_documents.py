@@ -11,7 +11,7 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-# The pages of the documents, which are built along with every run of all tests, execute the others, too.
+# `.ci/run` builds the pages of docs/, which executes the others; they take too long to be run here each time.
 QUICK = ("first_policy", "first_walk")
 
 
@@ -34,7 +34,6 @@ def test_there_are_notebooks():
 )
 def test_notebook_runs(path, monkeypatch, tmp_path):
     monkeypatch.setitem(os.environ, "FIRST_WALK_SECONDS", "3")
-    monkeypatch.setitem(os.environ, "HOLE_ITERATIONS", "50")
     notebook = nbformat.read(path, as_version=4)
     NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(path.parent)}}).execute()
 

@@ -60,7 +60,7 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
         def substep(state, control):
             return step(here, state, control), None
 
-        controls = servos.controls(shares.astype(before.dtype), before, after, speed)
+        controls = servos.controls(shares, before, after, speed)
         return lax.scan(substep, state, controls)[0]
 
     return control_step

@@ -44,12 +44,15 @@ class Servos(NamedTuple):
     ) -> Float[Array | np.ndarray, "*b n nu"]:
         """Return what the servos are told in each physics step of a control step, rad.
 
+        The set-points, ahead by `lead`, so that the servos' damping does not hold the motion back.
+
         Args:
             shares: What `physics.state.substep_shares` gives for the number of steps.
             before: Set-points at the start of the control step, rad.
             after: Set-points at its end, rad.
             speed: The set-points' speed, rad/s.
         """
+        shares = shares.astype(before.dtype)
         first, way, ahead = (x[..., None, :] for x in (before, after - before, self.lead * speed))
         return first + shares[:, None] * way + ahead
 

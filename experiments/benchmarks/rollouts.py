@@ -33,7 +33,8 @@ from creps_jax.tasks.nao_walk import CONTROL_PERIOD, Physics, load_nao, nao_walk
 from creps_jax.train import evaluate  # noqa: E402
 from experiments.walk import SETTINGS  # noqa: E402
 
-BATCH = 270
+_QUICK = SETTINGS["quick"]
+BATCH = _QUICK.trials * _QUICK.samples * _QUICK.repeats
 DURATION = 2.0
 ROUNDS = 5
 # A gait of about .33 m/s.

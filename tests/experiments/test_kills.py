@@ -36,7 +36,7 @@ def time_of(path):
 
 
 @pytest.mark.parametrize(
-    ("kills", "iterations"), [(1, 80), pytest.param(20, 2000, marks=pytest.mark.slow)], ids=["1", "20"]
+    ("kills", "iterations"), [(1, 120), pytest.param(20, 2000, marks=pytest.mark.slow)], ids=["1", "20"]
 )
 def test_a_killed_run_goes_on_to_the_same_bits(tmp_path, kills, iterations):
     settings = ["--iterations", str(iterations)]
