@@ -109,6 +109,9 @@ def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
     curves = {"rbf.episodes": 90 * (steps + 1), "rbf.sample_reward": np.tile(steps, (3, 1))}
     curves |= {"plain.episodes": 300 + 90 * steps[:8], "plain.sample_reward": np.full((3, 8), 6.0)}
     assert fig11_walk.share_of_episodes(curves, "plain") == pytest.approx(810 / 930)
+    assert arrays["rbf.halfway_reward"].shape == (2, 11, 3)
+    lacks = {"rbf.halfway_reward": np.full((3, 2, 2), -1.0), "plain.reward": np.full((3, 2, 2), -4.0)}
+    assert fig11_walk.halfway_lack(lacks) == 0.25
     lack = 1.0 / np.arange(1.0, 6.0)[:, None, None]
     assert fig11_walk.p_value({"a.reward": -lack, "b.reward": -2 * lack}, "a", "b") == pytest.approx(2.0**-5)
 
