@@ -73,10 +73,11 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         episodes of `plain`.
     """
     evaluate_key, learn_key = jax.random.split(key)
-    arrays = {}
+    arrays, policies = {}, {}
     for name, changes in CONTENDERS.items():
         changed = dataclasses.replace(settings, **changes)
         states, log = walk.learn_to_walk(changed, learn_key, session=session, name=name)
+        policies[name] = states.policy, log["coef"]
         speeds, outcome = walk.walk_at_all_speeds(changed, evaluate_key, states.policy)
         arrays["speeds"] = speeds
         # A resumed run may have gone on for longer than is asked of it now.
@@ -85,11 +86,10 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         arrays[f"{name}.sample_fell"] = log["outcome.fell"][:, : settings.iterations]
         for field in ("reward", "fell", "speed"):
             arrays[f"{name}.{field}"] = getattr(outcome, field)
-        if name == "rbf":
-            ours, coefs, final = changed, log["coef"], states.policy
     is_within = arrays["rbf.episodes"] <= arrays["plain.episodes"][-1] / 2
+    final, coefs = policies["rbf"]
     halfway = final._replace(coef=coefs[:, max(is_within.sum() - 1, 0)])
-    _, outcome = walk.walk_at_all_speeds(ours, evaluate_key, halfway)
+    _, outcome = walk.walk_at_all_speeds(settings, evaluate_key, halfway)
     arrays["rbf.halfway_reward"] = outcome.reward
     return arrays
 
@@ -123,9 +123,10 @@ def halfway_lack(arrays: Mapping[str, np.ndarray]) -> float:
 
 def _smoothed(arrays: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return how many rollouts there were (k,), and the mean rewards (trials, k) of the last `_SMOOTHED`."""
-    # One iteration alone has no difference.
     episodes, rewards = arrays[f"{name}.episodes"], arrays[f"{name}.sample_reward"]
-    width = max(1, min(round(_SMOOTHED / np.diff(episodes).max(initial=1)), rewards.shape[1]))
+    # All iterations but the first have as many; a single one has no difference.
+    in_iteration = np.diff(episodes).max(initial=1)
+    width = max(1, min(round(_SMOOTHED / in_iteration), rewards.shape[1]))
     windows = np.lib.stride_tricks.sliding_window_view(rewards, width, axis=1)
     return episodes[width - 1 :], windows.mean(axis=2)
 
