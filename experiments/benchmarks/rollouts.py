@@ -4,9 +4,10 @@
 
 Each round runs all in turn; the ratios are medians over the rounds. Ours have the controller in the loop; C
 MuJoCo replays what it told the servos in as many such walks, noise and all (without noise the solver has less
-to do), with `mujoco.rollout`, one thread a core, whole walks at once. What C gains from all
-threads over one tells how far this machine scales at all: cores that share a chip with others slow down
-when all are busy. As many walk at once as in an iteration of the preset `quick`.
+to do), with `mujoco.rollout`, one thread a core, whole walks at once. It does so with the model as it is, and
+without what ours leaves out by C: the sensors, and islands, of which one robot is one. What C gains from all
+threads over one tells how far this machine scales at all: cores that share a chip with others slow down when
+all are busy. As many walk at once as in an iteration of the preset `quick`.
 """
 
 from experiments.process import import_mjx_quietly, prepare, usable_cores
@@ -44,12 +45,14 @@ BALANCE = SETTINGS["best"].balance()
 
 def main() -> None:
     """Measure and print."""
-    model, cores = load_nao(), usable_cores()
+    model, no_extras, cores = load_nao(), load_nao(), usable_cores()
+    no_extras.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR | mujoco.mjtDisableBit.mjDSBL_ISLAND
     contestants = {
         "all devices": _ours(jax.devices()),
         "one device": _ours(jax.devices()[:1]),
         "all, stepped by C": _ours(jax.devices(), c.make_control_step),
         "C MuJoCo": _bare_c(model, cores),
+        "C, no extras": _bare_c(no_extras, cores),
         "C, one thread": _bare_c(model, 1),
     }
     for run in contestants.values():
@@ -69,6 +72,7 @@ def main() -> None:
         ("all devices", "one device"),
         ("all devices", "C MuJoCo"),
         ("all, stepped by C", "C MuJoCo"),
+        ("all, stepped by C", "C, no extras"),
         ("all, stepped by C", "one device"),
         ("C MuJoCo", "C, one thread"),
     ):

@@ -85,6 +85,18 @@ def test_one_control_step_equals_c(control_step, exact_model, change, saturates)
     assert (saturated > 0) == saturates
 
 
+def test_what_c_leaves_out_changes_nothing(model):
+    qpos = np.float32(starts(model, 0.0)[0])
+    commands = qpos[:, 7:], qpos[:, 7:], np.zeros((NUM, model.nu), np.float32)
+    ours = stepped(jax.jit(jax.vmap(c.make_control_step(model, 5))), model, qpos, commands)
+    assert model.nsensor and not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ISLAND
+    for i in range(NUM):
+        data = stepped_by_c(model, qpos[i], [x[i] for x in commands])
+        assert data.nisland == 1
+        np.testing.assert_array_equal(ours.qpos[i], np.float32(data.qpos))
+        np.testing.assert_array_equal(ours.qvel[i], np.float32(data.qvel))
+
+
 @pytest.mark.usefixtures("relaxed_promotion")
 def test_a_control_step_in_a_world_of_its_own_equals_c_with_another_model(control_step, exact_model):
     rng = np.random.default_rng(1)
