@@ -153,12 +153,15 @@ def creps(
         history = None if importance is None else empty_history(policy, importance.num_policies)
         return CrepsState(policy, archive, jnp.zeros((), jnp.int32), history)
 
-    def ask(key: PRNGKey, state: CrepsState, contexts: Array) -> Float[Array, "n d"]:
+    # Compiled here, as ask and tell are called by hand where a robot is real.
+    @jax.jit
+    def compiled_ask(key: PRNGKey, state: CrepsState, contexts: Array) -> Float[Array, "n d"]:
         keys = jax.random.split(key, contexts.shape[0])
         features = _features_of("policy_features", policy_features, contexts)
         return jax.vmap(gaussian.sample, (0, None, 0))(keys, state.policy, features)
 
-    def tell(state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
+    @jax.jit
+    def compiled_tell(state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
         archive = push(state.archive, batch)
         is_valid = valid(archive)
         # What is left out must not enter: 0 * nan is not 0.
@@ -194,28 +197,28 @@ def creps(
         )
         return CrepsState(policy, archive, state.iteration + 1, history), info
 
-    def mean(policy: LinearGaussian, contexts: Array) -> Float[Array, "n d"]:
+    @jax.jit
+    def compiled_mean(policy: LinearGaussian, contexts: Array) -> Float[Array, "n d"]:
         features = _features_of("policy_features", policy_features, contexts)
         return jax.vmap(gaussian.mean, (None, 0))(policy, features)
 
+    # Checked outside of what is compiled, where values can be seen.
     def checked_contexts(contexts: ArrayLike) -> Array:
         return checks.finite("contexts", _float32(checks.array("contexts", contexts, ("n", context_dim))))
 
-    # Compiled here, as ask and tell are called by hand where a robot is real; checked before, where values
-    # can be seen.
-    compiled_ask, compiled_tell, compiled_mean = jax.jit(ask), jax.jit(tell), jax.jit(mean)
-    return Creps(
-        init=init,
-        ask=lambda key, state, contexts: compiled_ask(
-            checks.key("key", key), _checked_state(state, policy_features), checked_contexts(contexts)
-        ),
-        tell=lambda state, batch: compiled_tell(
-            _checked_state(state, policy_features), _checked_batch(batch, state.archive)
-        ),
-        mean=lambda policy, contexts: compiled_mean(
-            _checked_policy("policy", policy, policy_features), checked_contexts(contexts)
-        ),
-    )
+    def ask(key: PRNGKey, state: CrepsState, contexts: ArrayLike) -> Array:
+        key, state = checks.key("key", key), _checked_state(state, policy_features)
+        return compiled_ask(key, state, checked_contexts(contexts))
+
+    def tell(state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
+        state = _checked_state(state, policy_features)
+        return compiled_tell(state, _checked_batch(batch, state.archive))
+
+    def mean(policy: LinearGaussian, contexts: ArrayLike) -> Array:
+        policy = _checked_policy("policy", policy, policy_features)
+        return compiled_mean(policy, checked_contexts(contexts))
+
+    return Creps(init, ask, tell, mean)
 
 
 def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array, is_valid: Array) -> Scalar:
@@ -295,8 +298,9 @@ def _checked_batch(batch: Batch, archive: Archive) -> Batch:
     checks.instance("batch", batch, Batch)
     reward = checks.array("batch.reward", batch.reward, ("n",))
     num, context_dim = reward.shape[0], archive.batch.context.shape[1]
-    context = checks.array("batch.context", batch.context, (num, context_dim))
-    theta = checks.array("batch.theta", batch.theta, (num, archive.batch.theta.shape[1]))
+    theta_dim, note = archive.batch.theta.shape[1], f" beside batch.reward {reward.shape}"
+    context = checks.array("batch.context", batch.context, (num, context_dim), note=note)
+    theta = checks.array("batch.theta", batch.theta, (num, theta_dim), note=note)
     return Batch(*map(_float32, (context, theta, reward)))
 
 

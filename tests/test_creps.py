@@ -221,9 +221,9 @@ def test_refuses_contexts_that_are_not_finite(key, state):
     [
         (((5, 1), (5, 2), (5, 1)), r"batch.reward must have shape \(n,\), got \(5, 1\)"),
         (((5, 1), (5, 2), (0,)), r"batch.reward must have shape \(n,\), got \(0,\)"),
-        (((5,), (5, 2), (5,)), r"batch.context must have shape \(5, 1\), got \(5,\)"),
-        (((4, 1), (5, 2), (5,)), r"batch.context must have shape \(5, 1\), got \(4, 1\)"),
-        (((5, 1), (5, 3), (5,)), r"batch.theta must have shape \(5, 2\), got \(5, 3\)"),
+        (((5,), (5, 2), (5,)), r"batch.context must have shape \(5, 1\) beside .*, got \(5,\)"),
+        (((4, 1), (5, 2), (5,)), r"batch.context must have shape \(5, 1\) beside .*, got \(4, 1\)"),
+        (((5, 1), (5, 3), (5,)), r"batch.theta must have shape \(5, 2\) beside .*, got \(5, 3\)"),
     ],
 )
 def test_refuses_batches_of_the_wrong_shape(state, shapes, message):
