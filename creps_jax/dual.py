@@ -18,9 +18,7 @@ Valid: TypeAlias = Bool[Array, " n"] | Float[Array, " n"]
 """Which samples count, or as numbers: how much each counts."""
 
 _NUM_ROUNDS = 4
-"""Most rounds of standardising and minimising for one bound."""
-_NUM_TRIES = 3
-"""Most bounds that are tried: the given one, and lower ones where it is out of reach."""
+"""Most rounds of standardising and minimising, before and after the bound may be given up."""
 _RESOLUTION = 5e-6
 """Lowest temperature, as a share of the numbers whose difference is the advantage: what float32 can order."""
 _LEAST_SPREAD = 3e-4
@@ -236,25 +234,25 @@ def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
 
 
 def _search(samples: _Samples, kl_bound: Array) -> _Guess:
-    """Improve a first guess, round by round; give up a bound that turns out to be out of reach.
+    """Improve a first guess, round by round; midway, give up a bound that is out of reach.
 
     One round is enough for well-behaved rewards. Where some are far worse than the others (falls), the scale
     and the baseline of all rewards say little of those that end up with a weight: each round takes both from
     the weights of the last.
     """
-    # No weights have more than all on the sample with the least prior: a bound far beyond that would only
-    # drive the temperature down to where rounding decides.
+    # No weights have more than all on the sample with the least prior. A bound far beyond that would drive
+    # the temperature down to where rounding decides; one nat beyond, it still does not count as met.
     kl_bound = jnp.minimum(kl_bound, 1.0 - jnp.min(_log(samples.prior)))
     first = _first_guess(samples, kl_bound)
 
     def is_going_on(search: tuple[_Guess, Array, Array]) -> Array:
         guess, _, num_rounds = search
-        return (num_rounds < _NUM_TRIES * _NUM_ROUNDS) & ~guess.is_settled
+        return (num_rounds < 2 * _NUM_ROUNDS) & ~guess.is_settled
 
     def improve(search: tuple[_Guess, Array, Array]) -> tuple[_Guess, Array, Array]:
         guess, bound, num_rounds = search
         # Rounding decides among greedy weights: start again, and stop a little short of them.
-        is_given_up = (num_rounds > 0) & (num_rounds % _NUM_ROUNDS == 0) & _misses(guess, bound)
+        is_given_up = (num_rounds == _NUM_ROUNDS) & _misses(guess, kl_bound)
         bound = jnp.where(is_given_up, _NEARLY_GREEDY * guess.kl, bound)
         restart = first._replace(is_active=jnp.zeros((), bool), num_steps=guess.num_steps)
         guess = jax.tree.map(lambda new, old: jnp.where(is_given_up, new, old), restart, guess)
