@@ -33,7 +33,7 @@ def make_control_step(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
     It does what `creps_jax.physics.mjx.make_control_step` does, but for rounding. A `jax.vmap` of it is one
     call for the whole batch. A robot whose state or set-points are not finite, or that C MuJoCo finds
     unstable (which it also writes to its log, MUJOCO_LOG.TXT), gets a state of NaN, and one that has such a
-    state takes no time. There are no gradients.
+    state takes no time. There are no gradients, and later changes of the model are not seen.
 
     Args:
         model: A model all of whose actuators are position servos on joints.
@@ -152,12 +152,12 @@ class _Tools:
 
 
 def _without_extras(model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return a copy of the model that moves as it does, but computes less on the way: a tenth of the time."""
+    """Return a copy of the model that moves as it does, in a tenth less time."""
     model = copy.copy(model)
     # Sensors only read, and nobody reads them here.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
-    if model.ntree == 1:
-        # What touches one tree is one island: the solver need not look for more.
+    # What touches one tree is one island: nothing but sleep needs it to be found.
+    if model.ntree == 1 and not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ISLAND
     return model
 

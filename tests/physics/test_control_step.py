@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.physics import c, mjx
 from creps_jax.physics.state import initial_state
 from creps_jax.physics.world import World, world_of
@@ -85,7 +86,9 @@ def test_one_control_step_equals_c(control_step, exact_model, change, saturates)
     assert (saturated > 0) == saturates
 
 
-def test_what_c_leaves_out_changes_nothing(model):
+@pytest.mark.parametrize("robot", [NAO, NAO_H25], ids=lambda robot: robot.name)
+def test_what_c_leaves_out_changes_nothing(robot):
+    model = load_nao(robot)
     qpos = np.float32(starts(model, 0.0)[0])
     commands = qpos[:, 7:], qpos[:, 7:], np.zeros((NUM, model.nu), np.float32)
     ours = stepped(jax.jit(jax.vmap(c.make_control_step(model, 5))), model, qpos, commands)
