@@ -181,7 +181,9 @@ def array(name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, 
         ValueError: If they are no real numbers, or have another shape.
     """
     try:
-        result = value if isinstance(value, jax.Array) else jnp.asarray(_by_numpy(value))
+        # What is too large for the format becomes infinite, and needs no warning besides.
+        with np.errstate(over="ignore"):
+            result = value if isinstance(value, jax.Array) else jnp.asarray(_by_numpy(value))
     except (TypeError, ValueError, OverflowError):
         result = None
     if result is None or not _is_real(result):

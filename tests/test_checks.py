@@ -85,6 +85,11 @@ def test_numbers_of_any_kind_become_floats(value, expected):
     np.testing.assert_array_equal(array, np.asarray(value, np.float32))
 
 
+@pytest.mark.parametrize("value", [1e300, [1e300], np.array(1e300)])
+def test_what_is_too_large_becomes_infinite_without_a_warning(value):
+    assert jnp.isinf(checks.array("x", value)).all()
+
+
 def test_an_array_that_is_good_is_returned_itself():
     array = jnp.ones(3)
     assert checks.finite("x", checks.array("x", array, ("n",)), above=0.0) is array
