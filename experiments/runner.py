@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from experiments import registry, results
+from experiments import folder_lock, registry, results
 from experiments.errors import UserError
 from experiments.learning import Session
 from experiments.tables import to_markdown
@@ -69,6 +69,20 @@ def run(request: Request, *, console: Console | None, say: Say) -> Path:
     if jax.process_index() > 0:
         return _help(experiment, request)
     settings, folder, manifest = (_resumed if request.resume else _started)(experiment, request)
+    with _for_itself(folder):
+        return _run(experiment, settings, folder, manifest, console=console, say=say)
+
+
+def _run(
+    experiment: registry.Experiment,
+    settings: Any,
+    folder: Path,
+    manifest: dict[str, Any],
+    *,
+    console: Console | None,
+    say: Say,
+) -> Path:
+    name = manifest["experiment"]
     say(f"results go to {folder}")
     before, begin = manifest["seconds"], time.monotonic()
 
@@ -79,7 +93,7 @@ def run(request: Request, *, console: Console | None, say: Say) -> Path:
     manifest["devices"] = [str(device) for device in jax.local_devices()]
     update("running")
     try:
-        session = Session(folder, _identity(request.name, settings, manifest["seed"]), console)
+        session = Session(folder, _identity(name, settings, manifest["seed"]), console)
         arrays = experiment.run(settings, jax.random.key(manifest["seed"]), session)
         results.save_arrays(folder / results.ARRAYS, arrays)
         _draw(experiment, arrays, folder, say)
@@ -87,7 +101,7 @@ def run(request: Request, *, console: Console | None, say: Say) -> Path:
             experiment.finish(settings, arrays, folder, say)  # type: ignore[attr-defined]
     except KeyboardInterrupt:
         update("interrupted")
-        say(f"stopped; to go on: python -m experiments run {request.name} --resume --out {folder}")
+        say(f"stopped; to go on: python -m experiments run {name} --resume --out {folder}")
         raise
     except Exception:
         update("failed")
@@ -97,6 +111,19 @@ def run(request: Request, *, console: Console | None, say: Say) -> Path:
         _save_claims(experiment, arrays, folder)
     say(f"finished in {manifest['seconds']:.0f} s: {folder}")
     return folder
+
+
+@contextlib.contextmanager
+def _for_itself(folder: Path) -> Iterator[None]:
+    """Keep a second process from going on with a run that is still running, where folders can be locked."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as stack:
+        # Some shared file systems know no locks.
+        with contextlib.suppress(OSError):
+            stack.enter_context(folder_lock.locked(folder, wait=0.0))
+            # While it is still held: a run leaves nothing but its results.
+            stack.callback((folder / folder_lock.LOCK).unlink, missing_ok=True)
+        yield
 
 
 def _help(experiment: registry.Experiment, request: Request) -> Path:

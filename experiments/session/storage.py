@@ -2,15 +2,12 @@
 
 import contextlib
 import dataclasses
-import fcntl
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TextIO
 
-from experiments import results
+from experiments import folder_lock, results
 from experiments.errors import UserError
 from experiments.session import plain
 from experiments.session.settings import Settings, load_settings
@@ -18,8 +15,6 @@ from experiments.session.trials import FORMAT, Record
 
 SETTINGS = "settings.json"
 TRIALS = "trials.json"
-_LOCK = ".lock"
-_PAUSE = 0.05
 
 
 def create(folder: Path, settings: Settings) -> None:
@@ -36,7 +31,7 @@ def create(folder: Path, settings: Settings) -> None:
         temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
         results.save_text(temporary / SETTINGS, plain.to_text(dataclasses.asdict(settings)) + "\n")
         save_record(temporary, Record(settings=settings.digest()))
-        (temporary / _LOCK).touch()
+        (temporary / folder_lock.LOCK).touch()
         temporary.chmod(0o777 & ~results.umask())
         temporary.rename(folder)
         temporary = None
@@ -105,35 +100,12 @@ def locked(folder: Path, *, wait: float) -> Iterator[None]:
     Raises:
         UserError: if another process is still at it then, or the folder cannot be locked.
     """
-    handle = _acquire(folder, wait)
-    try:
-        yield
-    finally:
-        handle.close()
-
-
-def _acquire(folder: Path, wait: float) -> TextIO:
-    """Return the open file that holds the lock until it is closed; a process that dies closes it."""
-    deadline = time.monotonic() + wait
     with contextlib.ExitStack() as stack:
         try:
-            handle = stack.enter_context((folder / _LOCK).open("a"))
-            while not _try_lock(handle):
-                if time.monotonic() >= deadline:
-                    raise UserError(f"{folder} is in use by another process, try again when it is done")
-                time.sleep(_PAUSE)
+            stack.enter_context(folder_lock.locked(folder, wait=wait))
             # A process that was killed while it wrote leaves what nobody reads.
             for leftover in folder.glob(f".{TRIALS}.*.part"):
                 leftover.unlink(missing_ok=True)
         except OSError as error:
             raise UserError(f"cannot lock {folder}: {error.strerror or error}") from error
-        stack.pop_all()
-        return handle
-
-
-def _try_lock(handle: TextIO) -> bool:
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+        yield

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments import learning, registry, results, runner
+from experiments import folder_lock, learning, registry, results, runner
 from experiments.cli import main
 from experiments.errors import UserError
 from experiments.runner import Request
@@ -60,6 +60,21 @@ def test_a_run_that_stopped_goes_on_with_the_same_numbers(tiny, monkeypatch, err
     for name, values in whole.items():
         np.testing.assert_array_equal(resumed[name], values)
     assert results.load_manifest(Path("part"))["status"] == "finished"
+
+
+def test_a_run_that_is_running_is_not_joined(tiny):
+    folder = run(out=Path("here"))
+    with folder_lock.locked(folder, wait=0.0), pytest.raises(UserError, match="here is in use by another"):
+        run(out=folder, resume=True)
+    run(out=folder, resume=True)
+
+
+def test_where_folders_cannot_be_locked_a_run_goes_on(tiny, monkeypatch):
+    def refuse(*_):
+        raise OSError("no locks here")
+
+    monkeypatch.setattr(folder_lock.fcntl, "flock", refuse)
+    assert results.load_manifest(run())["status"] == "finished"
 
 
 def test_resume_finds_the_latest_unfinished_run_and_can_lengthen_it(tiny, monkeypatch):
