@@ -1,9 +1,13 @@
 """Set up the process before jax and MuJoCo start: devices, threads, the compilation cache, quiet imports."""
 
+import _thread
 import contextlib
 import io
 import os
+import sys
+import threading
 from pathlib import Path
+from typing import Any
 
 from experiments.errors import UserError
 
@@ -78,6 +82,31 @@ def join_processes() -> None:
 
 
 def import_mjx_quietly() -> None:
-    """Import MJX while its lines about a missing Warp are kept from stdout."""
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(ImportError):
-        from mujoco import mjx  # noqa: F401
+    """Import MJX while its lines about a missing Warp are kept from stdout.
+
+    Raises:
+        UserError: if MuJoCo cannot start with the OpenGL that the environment names.
+    """
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(ImportError):
+            from mujoco import mjx  # noqa: F401
+    except (AttributeError, RuntimeError) as error:
+        name = os.environ.get("MUJOCO_GL")
+        if name is None:
+            raise
+        raise UserError(
+            f"MUJOCO_GL must name an OpenGL that is installed here, egl as a rule, or be unset, got {name!r}"
+        ) from error
+
+
+def keep_interrupts() -> None:
+    """Interrupt again where Ctrl-C came in a callback, such as a finaliser, that lets no exception out."""
+    tell = sys.unraisablehook
+
+    def hook(unraisable: Any) -> None:
+        if issubclass(unraisable.exc_type, KeyboardInterrupt):
+            threading.Timer(0.1, _thread.interrupt_main).start()
+        else:
+            tell(unraisable)
+
+    sys.unraisablehook = hook

@@ -1,6 +1,9 @@
 import json
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -53,6 +56,39 @@ def test_what_the_user_has_set_stays(tmp_path):
 def test_a_home_that_cannot_be_written_costs_only_the_cache(tmp_path):
     (tmp_path / "file").write_text("")
     assert "JAX_COMPILATION_CACHE_DIR" not in prepared(tmp_path, HOME=str(tmp_path / "file"))
+
+
+def test_an_opengl_that_is_not_there_is_named():
+    code = "from experiments.process import import_mjx_quietly; import_mjx_quietly()"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=ROOT,
+        env={**os.environ, "MUJOCO_GL": "bogus"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    error = done.stderr.splitlines()[-1]
+    assert error.endswith(
+        "MUJOCO_GL must name an OpenGL that is installed here, egl as a rule, or be unset, got 'bogus'"
+    )
+
+
+class InterruptedInCallback:
+    def __del__(self):
+        raise KeyboardInterrupt
+
+
+def test_an_interrupt_within_a_callback_is_not_lost(monkeypatch):
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    process.keep_interrupts()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            InterruptedInCallback()
+            time.sleep(10.0)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(
