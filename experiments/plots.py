@@ -198,6 +198,7 @@ def parameters_against_context(
     high: Sequence[float] | np.ndarray,
     context_label: str,
     title: str,
+    chosen: int = 0,
 ) -> Figure:
     """Draw each parameter of a policy against its context, in its own units, as small multiples.
 
@@ -210,9 +211,11 @@ def parameters_against_context(
         high: upper bounds.
         context_label: name and unit of the context.
         title: heading of the figure.
+        chosen: the trial whose policy is drawn thick, where there are several.
     """
     theta = np.asarray(theta, float)
     theta = theta[None] if theta.ndim == 2 else theta
+    others = np.delete(theta, chosen, axis=0)
     columns = min(5, len(names))
     rows = math.ceil(len(names) / columns)
     figure, grid = new_figure(rows, columns, width=2.6 * columns, height=2.1 * rows + 0.5, sharex=True)
@@ -222,10 +225,12 @@ def parameters_against_context(
             continue
         for bound in (low[index], high[index]):
             axes.axhline(bound, color=PAPER_COLOUR, linewidth=0.8, linestyle=":")
-        for trial in theta:
-            axes.plot(context, trial[:, index], color=COLOURS[0], linewidth=0.8 if len(theta) > 1 else 1.8)
-        if len(theta) > 1:
-            axes.plot(context, theta[..., index].mean(axis=0), color=COLOURS[0])
+        labels = itertools.chain(["of another trial"], itertools.repeat(None))
+        for trial, label in zip(others, labels, strict=False):
+            axes.plot(context, trial[:, index], color=COLOURS[0], linewidth=0.8, alpha=0.5, label=label)
+        axes.plot(
+            context, theta[chosen, :, index], color=COLOURS[0], linewidth=1.8, label="the policy that is kept"
+        )
         unit = f" ({units[index]})" if units[index] else ""
         axes.set_title(f"{names[index]}{unit}", fontsize=9)
     # The last row that is there labels each column.
@@ -233,6 +238,8 @@ def parameters_against_context(
         last = max(row for row in range(rows) if row * columns + column < len(names))
         grid[last, column].set_xlabel(context_label)
         grid[last, column].tick_params(labelbottom=True)
+    if len(others):
+        figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
 
@@ -442,7 +449,7 @@ def plot_ground(axes: Axes, center: float, width: float, depth: float) -> None:
 
 
 def _over_episodes(axes: Axes, title: str) -> None:
-    axes.set(xlabel="episodes", title=title)
+    axes.set(xlabel="episodes of each trial", title=title)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
 

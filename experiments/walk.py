@@ -397,6 +397,7 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
             high=arrays["bound_high"],
             context_label="asked speed (m/s)",
             title="What the robot changes to walk faster",
+            chosen=trial,
         ),
         "speed": plots.reached_against_asked(
             speeds,

@@ -89,6 +89,14 @@ def figures():
     yield "postures", axes[0, 0].figure
 
 
+def test_the_kept_policy_is_the_thick_line():
+    theta = np.array([0.1, 0.2, 0.3])[:, None, None] * np.ones((3, 5, 1))
+    settings = {"names": ["a"], "units": ["m"], "low": [0], "high": [1], "context_label": "s", "title": "t"}
+    figure = plots.parameters_against_context(np.arange(5.0), theta, **settings, chosen=1)
+    widths = {line.get_ydata()[0]: line.get_linewidth() for line in figure.axes[0].lines}
+    assert max(widths, key=widths.get) == pytest.approx(0.2)
+
+
 def test_figures_can_be_drawn_and_saved(tmp_path):
     for name, figure in figures():
         results.save_figure(tmp_path / f"{name}.png", figure)
