@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from creps_jax.checks import shown
 from creps_jax.constraints import sigmoid_gate
 from creps_jax.features import FeatureMap, linear_features, rbf_features
 from creps_jax.policy import LinearGaussian
@@ -129,12 +130,16 @@ class SavedPolicy:
         return mean if self.constraint == "none" else np.clip(mean, low, high)
 
 
-def save_policy(path: Path, saved: SavedPolicy) -> None:
+def save_policy(path: Path | str, saved: SavedPolicy) -> None:
     """Write a policy file, atomically.
 
     Raises:
-        UserError: if the policy would not be accepted by `load_policy`, or cannot be written.
+        UserError: if the policy would not be accepted by `load_policy`, the path is no .npz file, or it
+            cannot be written.
     """
+    path = _npz_path(path)
+    if not isinstance(saved, SavedPolicy):
+        raise UserError(f"saved must be a SavedPolicy, got {shown(saved)}")
     _check(path, saved)
     arrays = {
         "format": FORMAT,
@@ -154,14 +159,17 @@ def save_policy(path: Path, saved: SavedPolicy) -> None:
     save_arrays(path, arrays)
 
 
-def load_policy(path: Path) -> SavedPolicy:
+def load_policy(path: Path | str) -> SavedPolicy:
     """Read a policy file.
 
     Raises:
         UserError: if the file is missing, cut short, foreign, of another version, or holds what
             no policy can hold (NaN, shapes that do not fit each other).
     """
-    arrays = load_arrays(Path(path))
+    if not isinstance(path, Path | str):
+        raise UserError(f"path must be that of a file, got {shown(path)}")
+    path = Path(path)
+    arrays = load_arrays(path)
     if str(arrays.get("format")) != FORMAT:
         raise UserError(f"{path} is no policy file (its format is not {FORMAT!r})")
     if str(arrays.get("version")) != str(VERSION):
@@ -186,13 +194,19 @@ def load_policy(path: Path) -> SavedPolicy:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} is an incomplete policy file: {error}") from error
-    _check(Path(path), saved)
+    _check(path, saved)
     return saved
 
 
 def policies_folder(robot: str = "nao") -> Path:
     """Return the folder of the policies of a robot that come with the project."""
     return ROOT / "models" / robot / "policies"
+
+
+def _npz_path(path: Path | str) -> Path:
+    if not isinstance(path, Path | str) or Path(path).suffix != ".npz":
+        raise UserError(f"a policy file must be named .npz, got {shown(path)}")
+    return Path(path)
 
 
 def _check(path: Path, saved: SavedPolicy) -> None:

@@ -57,10 +57,12 @@ def show(
     say(f"policy: {path}")
     for name, unit, value in zip(policy.param_names, policy.param_units, theta, strict=True):
         say(f"  {name.replace('_', ' '):16}{value:8.4f} {unit}".rstrip())
-    video = folder / f"walk-{speed:.2f}.mp4"
+    walker = robot_of(policy)
+    whose = "" if walker == NAO else f"{walker.name}-"
+    video = folder / f"walk-{whose}{speed:.2f}.mp4"
     clips = record(policy, (speed,), seed=seed)
     say(clips[0].caption)
-    save_film(clips, video, say, robot=robot_of(policy))
+    save_film(clips, video, say, robot=walker)
 
 
 def film(

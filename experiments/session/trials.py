@@ -114,10 +114,14 @@ class Record:
             replace: whether another result may be in its place.
 
         Raises:
-            UserError: if there is no such trial, the reward is not finite, or there is another result that is
-                not to be, or can no longer be, replaced.
+            UserError: if there is no such trial, the reward is no finite number, or there is another result
+                that is not to be, or can no longer be, replaced.
         """
-        trial, reward = self.trial(trial_id), float(reward)
+        trial = self.trial(trial_id)
+        try:
+            reward = float(reward)
+        except (TypeError, ValueError):
+            raise UserError(f"the reward of trial {trial_id} must be a number, got {reward!r}") from None
         if not (math.isnan(reward) or is_number(reward)):
             raise UserError(
                 f"the reward of trial {trial_id} must be finite, or NaN if broken, got {reward:g}"

@@ -261,6 +261,13 @@ def test_a_killed_process_loses_nothing_that_it_acknowledged(tmp_path):
         assert {path.name for path in folder.iterdir()} == {"settings.json", "trials.json", ".lock"}
 
 
+@pytest.mark.parametrize("reward", ["x", None, [1.0, 2.0]])
+def test_a_reward_that_is_no_number_is_refused(session, reward):
+    session.ask()
+    with pytest.raises(UserError, match="the reward of trial 1 must be a number, got"):
+        session.tell(1, reward)
+
+
 def test_one_process_at_a_time_others_wait_or_say_so(session, monkeypatch):
     session.ask()
     monkeypatch.setattr(robot_session, "LOCK_SECONDS", 0.1)
