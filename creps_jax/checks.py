@@ -4,6 +4,7 @@ Types and shapes are known while a program is traced, values are not: those of t
 adds anything to a compiled program.
 """
 
+import contextlib
 import functools
 import inspect
 import math
@@ -181,9 +182,7 @@ def array(name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, 
         ValueError: If they are no real numbers, or have another shape.
     """
     try:
-        # What is too large for the format becomes infinite, and needs no warning besides.
-        with np.errstate(over="ignore"):
-            result = value if isinstance(value, jax.Array) else jnp.asarray(_by_numpy(value))
+        result = value if isinstance(value, jax.Array) else _converted(value)
     except (TypeError, ValueError, OverflowError):
         result = None
     if result is None or not _is_real(result):
@@ -302,12 +301,13 @@ def _checked_array(name: str, value: Any, axes: list[str], arrays: _Arrays) -> A
     return result
 
 
-def _by_numpy(value: Any) -> Any:
-    """Return what NumPy can take as an array of NumPy; jax takes letters in a list for types."""
-    try:
-        return np.asarray(value)
-    except (TypeError, ValueError):  # traced, or ragged
-        return value
+def _converted(value: Any) -> Array:
+    """Return an array of jax, by way of NumPy where that can: jax takes letters in a list for types."""
+    with contextlib.suppress(TypeError, ValueError):  # traced, or ragged
+        value = np.asarray(value)
+    # What is too large for the format becomes infinite, and needs no warning besides.
+    with np.errstate(over="ignore"):
+        return jnp.asarray(value)
 
 
 def _limits(least: float, above: float, largest: float = FLOAT32_MAX) -> str:

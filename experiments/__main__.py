@@ -4,10 +4,11 @@ import contextlib
 import os
 import sys
 
-from experiments.process import prepare
+from experiments.process import keep_interrupts, prepare
 
 if __name__ == "__main__":
     prepare()
+    keep_interrupts()
     from experiments.cli import INTERRUPTED, main
 
     code = main(sys.argv[1:])

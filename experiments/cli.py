@@ -15,7 +15,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
 from experiments import registry
 from experiments.errors import UserError
-from experiments.process import import_mjx_quietly, join_processes, keep_interrupts
+from experiments.process import import_mjx_quietly, join_processes
 from experiments.session import commands
 from experiments.session.commands import SessionCommand
 
@@ -231,7 +231,6 @@ def _run(command: Run) -> int:
     )
     # A run that is told to end saves what it has, as one that is interrupted does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    keep_interrupts()
     runner.run(request, console=Console(highlight=False, soft_wrap=True), say=_say)
     return 0
 

@@ -225,12 +225,10 @@ def parameters_against_context(
             continue
         for bound in (low[index], high[index]):
             axes.axhline(bound, color=PAPER_COLOUR, linewidth=0.8, linestyle=":")
-        labels = itertools.chain(["of another trial"], itertools.repeat(None))
-        for trial, label in zip(others, labels, strict=False):
-            axes.plot(context, trial[:, index], color=COLOURS[0], linewidth=0.8, alpha=0.5, label=label)
-        axes.plot(
-            context, theta[chosen, :, index], color=COLOURS[0], linewidth=1.8, label="the policy that is kept"
-        )
+        thin = {"linewidth": 0.8, "alpha": 0.5, "label": "of another trial"}
+        thick = {"linewidth": 1.8, "label": "the policy that is kept"}
+        axes.plot(context, others[..., index].T, color=COLOURS[0], **thin)
+        axes.plot(context, theta[chosen, :, index], color=COLOURS[0], **thick)
         unit = f" ({units[index]})" if units[index] else ""
         axes.set_title(f"{names[index]}{unit}", fontsize=9)
     # The last row that is there labels each column.
@@ -239,7 +237,9 @@ def parameters_against_context(
         grid[last, column].set_xlabel(context_label)
         grid[last, column].tick_params(labelbottom=True)
     if len(others):
-        figure.legend(*grid[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        once = dict(zip(labels, handles, strict=True))
+        figure.legend(once.values(), once.keys(), loc="outside upper right", ncols=2)
     figure.suptitle(title, x=0.01, ha="left", fontweight="bold", fontsize=11)
     return figure
 

@@ -137,7 +137,9 @@ def save_policy(path: Path | str, saved: SavedPolicy) -> None:
         UserError: if the policy would not be accepted by `load_policy`, the path is no .npz file, or it
             cannot be written.
     """
-    path = _npz_path(path)
+    path = _checked_path(path)
+    if path.suffix != ".npz":
+        raise UserError(f"a policy file must be named .npz, got {path}")
     if not isinstance(saved, SavedPolicy):
         raise UserError(f"saved must be a SavedPolicy, got {shown(saved)}")
     _check(path, saved)
@@ -166,9 +168,7 @@ def load_policy(path: Path | str) -> SavedPolicy:
         UserError: if the file is missing, cut short, foreign, of another version, or holds what
             no policy can hold (NaN, shapes that do not fit each other).
     """
-    if not isinstance(path, Path | str):
-        raise UserError(f"path must be that of a file, got {shown(path)}")
-    path = Path(path)
+    path = _checked_path(path)
     arrays = load_arrays(path)
     if str(arrays.get("format")) != FORMAT:
         raise UserError(f"{path} is no policy file (its format is not {FORMAT!r})")
@@ -203,9 +203,9 @@ def policies_folder(robot: str = "nao") -> Path:
     return ROOT / "models" / robot / "policies"
 
 
-def _npz_path(path: Path | str) -> Path:
-    if not isinstance(path, Path | str) or Path(path).suffix != ".npz":
-        raise UserError(f"a policy file must be named .npz, got {shown(path)}")
+def _checked_path(path: Path | str) -> Path:
+    if not isinstance(path, Path | str):
+        raise UserError(f"path must be that of a file, got {shown(path)}")
     return Path(path)
 
 

@@ -82,6 +82,7 @@ def _run(
     console: Console | None,
     say: Say,
 ) -> Path:
+    """Run, or go on, in a folder that no other process uses, and keep its manifest up to date."""
     name = manifest["experiment"]
     say(f"results go to {folder}")
     before, begin = manifest["seconds"], time.monotonic()

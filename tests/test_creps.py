@@ -216,14 +216,17 @@ def test_refuses_contexts_that_are_not_finite(key, state):
         )
 
 
+BESIDE = r"beside batch.reward \(5,\)"
+
+
 @pytest.mark.parametrize(
     ("shapes", "message"),
     [
         (((5, 1), (5, 2), (5, 1)), r"batch.reward must have shape \(n,\), got \(5, 1\)"),
         (((5, 1), (5, 2), (0,)), r"batch.reward must have shape \(n,\), got \(0,\)"),
-        (((5,), (5, 2), (5,)), r"batch.context must have shape \(5, 1\) beside .*, got \(5,\)"),
-        (((4, 1), (5, 2), (5,)), r"batch.context must have shape \(5, 1\) beside .*, got \(4, 1\)"),
-        (((5, 1), (5, 3), (5,)), r"batch.theta must have shape \(5, 2\) beside .*, got \(5, 3\)"),
+        (((5,), (5, 2), (5,)), rf"batch.context must have shape \(5, 1\) {BESIDE}, got \(5,\)"),
+        (((4, 1), (5, 2), (5,)), rf"batch.context must have shape \(5, 1\) {BESIDE}, got \(4, 1\)"),
+        (((5, 1), (5, 3), (5,)), rf"batch.theta must have shape \(5, 2\) {BESIDE}, got \(5, 3\)"),
     ],
 )
 def test_refuses_batches_of_the_wrong_shape(state, shapes, message):
