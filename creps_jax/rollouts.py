@@ -13,20 +13,35 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from creps_jax.tasks.base import Task, check_outcome
 from creps_jax.typing import Array, Bool, Float, PRNGKey
 
-__all__ = ["Devices", "device_tuple", "mean_outcome", "replicate", "roll_out", "share_rows", "spread_rows"]
+__all__ = [
+    "Devices",
+    "device_tuple",
+    "from_host",
+    "mean_outcome",
+    "replicate",
+    "roll_out",
+    "share_rows",
+    "spread_rows",
+]
 
 Devices = Sequence[jax.Device] | None
 """Devices that share the rollouts; None stands for all local ones."""
 
+ChosenDevices = tuple[jax.Device, ...]
+"""Devices in a form that can be compiled for; none of them: wherever the arrays are."""
 
-def device_tuple(devices: Devices) -> tuple[jax.Device, ...]:
+
+def device_tuple(devices: Devices) -> ChosenDevices:
     """Return the devices in a form that can be compiled for; all local ones for None.
+
+    Where there is only one local device, None chooses nothing: arrays stay where they are.
 
     Raises:
         ValueError: If there is no device, or something else among them.
     """
     if devices is None:
-        return tuple(jax.local_devices())
+        local = tuple(jax.local_devices())
+        return local if len(local) > 1 else ()
     given = tuple(devices) if isinstance(devices, Iterable) else ()
     if not given or not all(isinstance(device, jax.Device) for device in given):
         raise ValueError(f"devices must be one device or more, as jax.devices() has them, got {devices!r}")
@@ -36,7 +51,7 @@ def device_tuple(devices: Devices) -> tuple[jax.Device, ...]:
 @partial(jax.jit, static_argnums=(0, 1))
 def roll_out(
     task: Task,
-    devices: tuple[jax.Device, ...],
+    devices: ChosenDevices,
     key: PRNGKey,
     contexts: Float[Array, "n s"],
     thetas: Float[Array, "n d"],
@@ -45,7 +60,8 @@ def roll_out(
 
     Args:
         task: What to roll out.
-        devices: Devices that share the rollouts.
+        devices: Devices that share the rollouts. With fewer than two they run where the arrays are, see
+            `replicate`.
         key: Random key; that of a rollout follows from its number, whatever device it runs on.
         contexts: Context of each rollout.
         thetas: Parameters of each rollout.
@@ -68,17 +84,32 @@ def roll_out(
     return outcomes._replace(reward=reward), is_failed
 
 
-def replicate(tree: Any, devices: tuple[jax.Device, ...]) -> Any:
-    """Put arrays on all devices, where `roll_out` leaves its results.
+def replicate(tree: Any, devices: ChosenDevices) -> Any:
+    """Put arrays on all chosen devices, where `roll_out` leaves its results, from wherever they are.
 
-    A state that an iteration finds elsewhere than it leaves it would have the next one compiled anew.
+    A state that an iteration finds elsewhere than it leaves it would have the next one compiled anew. While a
+    program is traced, this says on which devices it runs.
     """
-    if len(devices) == 1:
+    if not devices:
         return tree
-    return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec()))
+    sharding = NamedSharding(_mesh(devices), PartitionSpec())
+    if sharding.is_fully_addressable:
+        return jax.device_put(tree, sharding)
+    return jax.tree.map(partial(_put_everywhere, sharding), tree)
 
 
-def spread_rows(tree: Any, devices: tuple[jax.Device, ...]) -> Any:
+def from_host(tree: Any, devices: ChosenDevices) -> Any:
+    """Make jax arrays of those of the host; where one device was chosen, it holds them.
+
+    They are not bound to it, so that they can be compared with those of another run.
+    """
+    if len(devices) != 1:
+        return jax.tree.map(jnp.asarray, tree)
+    with jax.default_device(devices[0]):
+        return jax.tree.map(jnp.asarray, tree)
+
+
+def spread_rows(tree: Any, devices: ChosenDevices) -> Any:
     """Put the rows of arrays on the devices to which `share_rows` gives them."""
     return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec("rows")))
 
@@ -93,18 +124,26 @@ def mean_outcome(outcomes: Any, is_counted: Bool[Array, " n"]) -> Any:
     return jax.tree.map(mean, outcomes)
 
 
-def share_rows(function: Callable, devices: tuple[jax.Device, ...]) -> Callable:
+def share_rows(function: Callable, devices: ChosenDevices) -> Callable:
     """Share the rows of a function's arguments out over devices, which have to divide their number."""
     rows = PartitionSpec("rows")
     # Unchecked, so that a rollout may start its loops from constants, as it may on one device.
     return jax.shard_map(function, mesh=_mesh(devices), in_specs=rows, out_specs=rows, check_vma=False)
 
 
-def _mesh(devices: tuple[jax.Device, ...]) -> Mesh:
+def _put_everywhere(sharding: NamedSharding, array: Array) -> Array:
+    """Put an array on the devices of several processes, which jax does not do with typed keys."""
+    if not jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        return jax.device_put(array, sharding)
+    data = jax.device_put(jax.random.key_data(array), sharding)
+    return jax.random.wrap_key_data(data, impl=jax.random.key_impl(array))
+
+
+def _mesh(devices: ChosenDevices) -> Mesh:
     return Mesh(np.asarray(devices), ("rows",))
 
 
-def _shared_out(function: Callable, devices: tuple[jax.Device, ...]) -> Callable:
+def _shared_out(function: Callable, devices: ChosenDevices) -> Callable:
     """Share a batch out over devices; the last row fills up what does not divide."""
     sharded = share_rows(function, devices)
 

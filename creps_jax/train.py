@@ -21,6 +21,7 @@ from creps_jax.policy import LinearGaussian
 from creps_jax.rollouts import (
     Devices,
     device_tuple,
+    from_host,
     mean_outcome,
     replicate,
     roll_out,
@@ -87,7 +88,8 @@ def make_iteration(
 
     @checks.arguments
     def iteration(key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
-        return _iterate(setup, key, replicate(_checked_state("state", state), setup.devices))
+        key, state = replicate((key, _checked_state("state", state)), setup.devices)
+        return _iterate(setup, key, state)
 
     return iteration
 
@@ -130,9 +132,10 @@ def train(
     _check_callback(on_iteration)
     state = _checked_start(start) if isinstance(start, CrepsState) else algorithm.init(start)
     phases = _phases(task, algorithm, state, iterations, samples, first_samples, devices)
-    state = replicate(state, phases[0][0].devices)
+    chosen = phases[0][0].devices
+    key, state = replicate((key, state), chosen)
     state, logs = _run(_iterate, phases, key, state, on_iteration)
-    return state, jax.tree.map(jnp.asarray, logs)
+    return state, from_host(logs, chosen)
 
 
 @checks.arguments
@@ -186,9 +189,9 @@ def train_trials(
     if _shares_trials(setup, num_trials):
         keys, states = spread_rows((keys, states), setup.devices)
     else:
-        states = replicate(states, setup.devices)
+        keys, states = replicate((keys, states), setup.devices)
     states, logs = _run(_iterate_trials, phases, keys, states, on_iteration)
-    return states, jax.tree.map(lambda x: jnp.asarray(np.swapaxes(x, 0, 1)), logs)
+    return states, from_host(jax.tree.map(lambda x: np.swapaxes(x, 0, 1), logs), setup.devices)
 
 
 @checks.arguments
@@ -224,8 +227,10 @@ def evaluate(
             f"the task takes contexts (n, {task.context_dim}) and thetas (n, {task.theta_dim}), "
             f"got {contexts.shape} and {thetas.shape}"
         )
+    chosen = device_tuple(devices)
+    key, contexts, thetas = replicate((key, contexts, thetas), chosen)
     contexts, thetas = (jnp.repeat(x, repeats, axis=0) for x in (contexts, thetas))
-    outcomes, _ = roll_out(task, device_tuple(devices), key, contexts, thetas)
+    outcomes, _ = roll_out(task, chosen, key, contexts, thetas)
     return jax.tree.map(lambda x: x.reshape(num, repeats, *x.shape[1:]), outcomes)
 
 
