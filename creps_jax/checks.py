@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from creps_jax.keys import key_shape
 from creps_jax.typing import Array, PRNGKey, ScalarLike
 
 __all__ = [
@@ -230,10 +231,12 @@ def finite(
 def key(name: str, value: Any, *, num_axes: int = 0) -> Any:
     """Return a random key as it is, or an array of keys, after checking that it is one.
 
+    Typed keys may be of any implementation; raw ones, of uint32, are of the default one.
+
     Raises:
         ValueError: If it is something else, or has another number of axes.
     """
-    shape = _key_shape(value)
+    shape = key_shape(value)
     if shape is None or len(shape) != num_axes or 0 in shape:
         examples = (
             "a random key, such as jax.random.key(0)",
@@ -326,13 +329,3 @@ def _is_number(value: Any) -> bool:
 
 def _is_real(values: np.ndarray | jax.Array) -> bool:
     return any(jnp.issubdtype(values.dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
-
-
-def _key_shape(value: Any) -> tuple[int, ...] | None:
-    """Return the shape of an array of keys, the new ones or rows of two uint32; None if it is none."""
-    if not isinstance(value, np.ndarray | jax.Array):
-        return None
-    if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
-        return value.shape
-    is_old = value.dtype == np.uint32 and value.shape[-1:] == (2,)
-    return value.shape[:-1] if is_old else None

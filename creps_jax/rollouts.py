@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from creps_jax.keys import threefry
 from creps_jax.tasks.base import Task, check_outcome
 from creps_jax.typing import Array, Bool, Float, PRNGKey
 
@@ -74,7 +75,7 @@ def roll_out(
         ValueError: If a rollout of the task gives anything but an outcome with one reward.
     """
     num = contexts.shape[0]
-    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(num))
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry(key), jnp.arange(num))
     rollouts = jax.vmap(lambda *arguments: check_outcome(task.rollout(*arguments)))
     if len(devices) > 1:
         rollouts = _shared_out(rollouts, devices)

@@ -17,6 +17,7 @@ from jaxtyping import Key, UInt32
 from creps_jax import checks
 from creps_jax.archive import Archive, Batch
 from creps_jax.creps import Creps, CrepsInfo, CrepsState
+from creps_jax.keys import threefry
 from creps_jax.policy import LinearGaussian
 from creps_jax.rollouts import (
     Devices,
@@ -140,7 +141,7 @@ def train(
 
 @checks.arguments
 def train_trials(
-    keys: Key[Array, " trials"] | UInt32[Array, "trials 2"],
+    keys: Key[Array, " trials"] | UInt32[Array, "trials _"],
     task: Task,
     algorithm: Creps,
     start: LinearGaussian | CrepsState,
@@ -253,7 +254,7 @@ def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState
     _check_fit(task, state)
     # The barriers keep the compiler from fusing an iteration with what surrounds it, which rounds
     # differently in a scan and on its own.
-    key, state = lax.optimization_barrier((key, state))
+    key, state = lax.optimization_barrier((threefry(key), state))
     context_key, theta_key, rollout_key = jax.random.split(jax.random.fold_in(key, state.iteration), 3)
     contexts = jax.vmap(partial(_sample_context, task))(jax.random.split(context_key, samples))
     thetas = algorithm.ask(theta_key, state, contexts)

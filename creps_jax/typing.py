@@ -37,5 +37,5 @@ VectorLike: TypeAlias = (
 )
 """A number, a sequence of numbers or a vector: bounds and other settings, given outside of any trace."""
 
-PRNGKey: TypeAlias = Key[Array, ""] | UInt32[Array, "2"]
-"""A random key, new style (`jax.random.key`) or old style (`jax.random.PRNGKey`)."""
+PRNGKey: TypeAlias = Key[Array, ""] | UInt32[Array, " _"]
+"""A random key, new style (`jax.random.key`) or old style (`jax.random.PRNGKey`), of any implementation."""

@@ -170,6 +170,42 @@ def test_the_only_device_is_no_choice(monkeypatch):
     trained_trials(trial_keys(2), START, None)
 
 
+def keys_of_all_kinds():
+    for implementation in ("threefry2x32", "rbg", "unsafe_rbg"):
+        yield f"typed {implementation}", None, jax.random.key(5, impl=implementation)
+        with jax.default_prng_impl(implementation):
+            yield f"raw {implementation}", implementation, jax.random.PRNGKey(5)
+
+
+KEYS = {name: (implementation, key) for name, implementation, key in keys_of_all_kinds()}
+
+
+def default_implementation(implementation):
+    return contextlib.nullcontext() if implementation is None else jax.default_prng_impl(implementation)
+
+
+@pytest.mark.parametrize(("implementation", "key"), KEYS.values(), ids=KEYS)
+@pytest.mark.parametrize("name", ["evaluate", "make_iteration"])
+def test_numbers_of_any_key_do_not_depend_on_the_devices(name, implementation, key):
+    with default_implementation(implementation):
+        _, inputs, function = RUNS[name]
+        alone = function(key, inputs(), [FIRST])
+        assert_same(alone, function(key, inputs(), [SECOND, FIRST]))
+        assert np.isfinite(jax.tree.leaves(alone)[0]).all()
+
+
+@pytest.mark.parametrize("implementation", ["threefry2x32", "rbg", "unsafe_rbg"])
+@pytest.mark.parametrize("is_raw", [False, True], ids=["typed", "raw"])
+@pytest.mark.parametrize("num", [2, 3])
+def test_numbers_of_trials_of_any_keys_are_those_of_runs_of_their_own(num, is_raw, implementation):
+    with jax.default_prng_impl(implementation):
+        keys = jax.random.split((jax.random.PRNGKey if is_raw else jax.random.key)(0), num)
+        states, logs = trained_trials(keys, START, [FIRST, SECOND])
+        for trial, key in enumerate(keys):
+            single = train(key, TASK, ALGORITHM, START, iterations=2, samples=5, devices=[SECOND])
+            assert_same(jax.tree.map(lambda x, trial=trial: x[trial], (states, logs)), single)
+
+
 NAN_TASK = dataclasses.replace(
     TASK,
     rollout=lambda key, context, theta: PlainOutcome(
