@@ -4,11 +4,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
 
 from creps_jax import checks
-from creps_jax.typing import Array, Bool, Float, Int, IntScalar
+from creps_jax.typing import Array, Bool, Float, Int, IntScalar, Scalar
 
-__all__ = ["Archive", "Batch", "empty_archive", "push", "valid"]
+__all__ = ["Archive", "Batch", "centred_reward", "empty_archive", "push", "split_reward", "valid"]
 
 
 class Batch(NamedTuple):
@@ -23,56 +25,140 @@ class Archive(NamedTuple):
     """The last L samples, where `batch` has L slots.
 
     Attributes:
-        batch: The slots, in no particular order of age; slots never written hold zeros.
+        batch: The slots, in no particular order of age. Slots never written, and numbers of a sample that were
+            not finite, hold zeros.
         next_index: The slot that the next sample goes to.
         size: How many slots have been written, at most L.
         age: How many batches were pushed after that of each slot.
+        is_valid: Which slots hold a sample that was finite throughout.
+        reward_rest: What the rounding of each reward to the precision of the archive has left out: float64
+            rewards in an archive of float32 keep their differences beside a large offset.
+        reward_rounding: How exact each reward is: the rounding error of the precision in which it was given.
     """
 
     batch: Batch
     next_index: IntScalar
     size: IntScalar
     age: Int[Array, " L"]
+    is_valid: Bool[Array, " L"]
+    reward_rest: Float[Array, " L"]
+    reward_rounding: Float[Array, " L"]
 
 
 @checks.arguments
-def empty_archive(archive_size: int, context_dim: int, theta_dim: int) -> Archive:
-    """Make an archive of `archive_size` empty slots.
+def empty_archive(
+    archive_size: int, context_dim: int, theta_dim: int, dtype: DTypeLike = jnp.float32
+) -> Archive:
+    """Make an archive of `archive_size` empty slots, whose numbers have the given precision.
 
     Raises:
         ValueError: If `archive_size` is no whole number of at least 1.
     """
-    batch = Batch(
-        context=jnp.zeros((archive_size, context_dim), jnp.float32),
-        theta=jnp.zeros((archive_size, theta_dim), jnp.float32),
-        reward=jnp.zeros(archive_size, jnp.float32),
-    )
+    numbers = jnp.zeros(archive_size, dtype)
     zero = jnp.zeros((), jnp.int32)
-    return Archive(batch, next_index=zero, size=zero, age=jnp.zeros(archive_size, jnp.int32))
+    return Archive(
+        batch=Batch(
+            context=jnp.zeros((archive_size, context_dim), dtype),
+            theta=jnp.zeros((archive_size, theta_dim), dtype),
+            reward=numbers,
+        ),
+        next_index=zero,
+        size=zero,
+        age=jnp.zeros(archive_size, jnp.int32),
+        is_valid=jnp.zeros(archive_size, bool),
+        reward_rest=numbers,
+        reward_rounding=numbers,
+    )
 
 
-def push(archive: Archive, batch: Batch) -> Archive:
+def push(archive: Archive, batch: Batch, reward_rest: Float[Array, " n"] | None = None) -> Archive:
     """Add a batch of samples, each in the place of the oldest once the archive is full.
 
     Of a batch larger than the archive its last L samples stay, as if they were added one by one.
+
+    Args:
+        archive: Where to add them.
+        batch: The samples, in the precision of the archive.
+        reward_rest: What the rewards are more precisely, see `split_reward`; None where they were given in
+            the precision of the archive.
+
+    Returns:
+        The new archive.
     """
     archive_size = archive.batch.reward.shape[0]
     num_new = batch.reward.shape[0]
     first_kept = max(0, num_new - archive_size)
     slots = (archive.next_index + jnp.arange(first_kept, num_new, dtype=jnp.int32)) % archive_size
+    is_finite = _is_finite(batch)
+    # No NaN stays: it would end a program in which jax looks out for them (`jax_debug_nans`).
+    batch = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, jnp.zeros_like(x)), batch)
+    eps = jnp.finfo(batch.reward.dtype).eps
+    if reward_rest is None:
+        rest, rounding = jnp.zeros_like(batch.reward), eps * jnp.abs(batch.reward)
+    else:
+        rest = jnp.where(is_finite, reward_rest, jnp.zeros_like(reward_rest))
+        # Of float64, whose rounding is about the square of that of float32; and of the rest, as it is kept.
+        rounding = eps**2 * jnp.abs(batch.reward) + eps * jnp.abs(rest)
+
+    def put(old: Array, new: Array) -> Array:
+        return old.at[slots].set(new[first_kept:])
+
     return Archive(
-        batch=jax.tree.map(lambda old, new: old.at[slots].set(new[first_kept:]), archive.batch, batch),
+        batch=jax.tree.map(put, archive.batch, batch),
         next_index=(archive.next_index + num_new) % archive_size,
         size=jnp.minimum(archive.size + num_new, archive_size),
         age=(archive.age + 1).at[slots].set(0),
+        is_valid=put(archive.is_valid, is_finite),
+        reward_rest=put(archive.reward_rest, rest),
+        reward_rounding=put(archive.reward_rounding, rounding),
     )
 
 
 def valid(archive: Archive) -> Bool[Array, " L"]:
     """Tell which slots can be learned from: those written with finite numbers only."""
-    context, theta, reward = archive.batch
-    is_written = jnp.arange(reward.shape[0], dtype=jnp.int32) < archive.size
-    is_finite = (
-        jnp.isfinite(reward) & jnp.all(jnp.isfinite(context), axis=1) & jnp.all(jnp.isfinite(theta), axis=1)
-    )
-    return is_written & is_finite
+    return archive.is_valid
+
+
+def split_reward(
+    reward: Array | np.ndarray, dtype: DTypeLike
+) -> tuple[Array | np.ndarray, Array | np.ndarray | None]:
+    """Split rewards into a part in the precision of an archive, and the rest where they are more precise.
+
+    Args:
+        reward: Rewards (n,), of any precision; those of NumPy are split by NumPy, before jax narrows them.
+        dtype: The precision of the archive.
+
+    Returns:
+        Rewards and rest; their sum is the given reward to about twice the digits. None for the rest where the
+        rewards are not more precise.
+    """
+    # What is too large for the format becomes infinite: such a sample is not valid.
+    with np.errstate(over="ignore", invalid="ignore"):
+        rounded = reward.astype(dtype)
+        if reward.dtype.itemsize <= np.dtype(dtype).itemsize:
+            return rounded, None
+        return rounded, (reward - rounded.astype(reward.dtype)).astype(dtype)
+
+
+def centred_reward(archive: Archive) -> tuple[Float[Array, " L"], Scalar]:
+    """Return the rewards less the largest of the valid ones, and the largest rounding error of one of them.
+
+    Subtracting the largest changes no weight of a sample. It is done here, before the rest of the rewards is
+    lost in their rounding. Rewards of slots that are not valid are zero.
+    """
+    reward, rest, is_valid = archive.batch.reward, archive.reward_rest, archive.is_valid
+    largest = jnp.max(jnp.where(is_valid, reward, -jnp.inf))
+    rest_of_largest = jnp.max(jnp.where(is_valid & (reward == largest), rest, -jnp.inf))
+    largest, rest_of_largest = (jnp.where(jnp.any(is_valid), x, 0.0) for x in (largest, rest_of_largest))
+    # By halves: a difference of finite numbers may be infinite.
+    limit = 0.5 * jnp.finfo(reward.dtype).max
+    halves = jnp.maximum(0.5 * reward - 0.5 * largest, -limit)
+    difference = 2.0 * halves + (rest - rest_of_largest)
+    centred = jnp.maximum(difference, -2.0 * limit)
+    rounding = jnp.max(archive.reward_rounding, where=is_valid, initial=0.0)
+    return jnp.where(is_valid, centred, 0.0), rounding
+
+
+def _is_finite(batch: Batch) -> Bool[Array, " n"]:
+    context, theta, reward = batch
+    return jnp.isfinite(reward) & jnp.all(jnp.isfinite(context), axis=1) & jnp.all(jnp.isfinite(theta), axis=1)

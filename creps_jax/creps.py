@@ -5,8 +5,11 @@ robot, calls `ask`, measures, and calls `tell`; `creps_jax.train` does so for a 
 """
 
 import dataclasses
-from collections.abc import Callable
-from typing import NamedTuple
+import functools
+import warnings
+import weakref
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +19,24 @@ from jax.typing import ArrayLike
 
 from creps_jax import checks
 from creps_jax import policy as gaussian
-from creps_jax.archive import Archive, Batch, empty_archive, push, valid
+from creps_jax.archive import Archive, Batch, centred_reward, empty_archive, push, split_reward
 from creps_jax.dual import DualSolution, sample_kl, sample_weights, solve_dual
+from creps_jax.evidence import blended_cov_chol, independence_p_value, share_of_evidence
 from creps_jax.features import FeatureMap
 from creps_jax.importance import Importance, PolicyHistory, empty_history, importance_weights, remember
+from creps_jax.keys import threefry
 from creps_jax.linalg import exact_dot
 from creps_jax.mstep import MStep, WeightedSamples, bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
-from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar
+from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar, ScalarLike
 
 __all__ = ["Creps", "CrepsInfo", "CrepsState", "creps"]
+
+_ENOUGH_SAMPLES = 3
+"""Samples that the archive should hold for each feature and parameter: weights within the usual KL bound of
+0.5 nats leave about a third of the samples effective."""
+_COARSE_REWARDS = 1e-3
+"""Share of the rewards' spread from which on their rounding is worth a warning."""
 
 
 class CrepsState(NamedTuple):
@@ -60,39 +71,204 @@ class CrepsInfo(NamedTuple):
     """How many archived samples the update was made from; those that are not finite are left out, and those
     of policies that the history no longer holds."""
     is_updated: Bool[Array, ""]
-    """False where the policy was kept, because there were too few samples to fit one."""
+    """False where the policy was kept, to the bit: there were too few samples to fit one, or the rewards do not
+    differ after the baseline."""
+    p_value: Scalar
+    """How likely weights that have nothing to do with the parameters would depend on them as strongly as these
+    do; see `creps_jax.evidence`. The covariance moves only where this is below `significance`."""
+    unsupported_loss: Scalar
+    """Entropy that this update took without evidence, in nats: the loss of entropy times the p-value. Its sum
+    over a search warns of exploration that went without evidence: d parameters whose spread has fallen to
+    exp(-x) by chance add up to about d x."""
+    reward_rounding: Scalar
+    """Rounding error of the rewards, in the precision in which they were told, as a share of their spread.
+    From about 0.1 on little can be learned: tell rewards in float64, or without their common offset."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Creps:
-    """The algorithm as a record of pure functions, closed over and never traced.
+    """The algorithm: its settings as data, see `creps`, and four pure functions of them.
 
-    All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters.
-
-    Attributes:
-        init: (policy) -> state, with an empty archive.
-        ask: (key, state, contexts (n, s)) -> thetas (n, d), drawn from the policy.
-        tell: (state, batch) -> (state, info): archive the batch, fit a new policy to the archive. A
-            sample that holds NaN or infinity, such as a measurement that failed, takes its place in the
-            archive and is then ignored. The policy is kept until the archive holds as many valid
-            samples as the policy has features and parameters, p + d: fewer leave the covariance singular.
-        mean: (policy, contexts (n, s)) -> thetas (n, d), the policy without its exploration.
+    All functions may be jitted and vmapped; shapes are n samples, s context variables, d parameters. Algorithms
+    of equal settings share their compiled programs, whatever their KL bounds, and the last one frees them. An
+    algorithm whose features and M-step are data, as those of this library are, can be pickled.
     """
 
-    init: Callable[[LinearGaussian], CrepsState]
-    ask: Callable[[PRNGKey, CrepsState, ArrayLike], Array]
-    tell: Callable[[CrepsState, Batch], tuple[CrepsState, CrepsInfo]]
-    mean: Callable[[LinearGaussian, ArrayLike], Array]
+    policy_features: FeatureMap
+    baseline_features: FeatureMap
+    kl_bound: ScalarLike
+    archive_size: int
+    ridge: float | int
+    m_step: MStep
+    importance: Importance | None
+    significance: float | int | None
 
-    def __post_init__(self) -> None:
-        """Check the functions."""
-        for name, arguments in (
-            ("init", "(policy)"),
-            ("ask", "(key, state, contexts)"),
-            ("tell", "(state, batch)"),
-            ("mean", "(policy, contexts)"),
-        ):
-            checks.function(name, getattr(self, name), arguments)
+    def init(self, policy: LinearGaussian) -> CrepsState:
+        """Begin with a policy and an empty archive, both in the precision of the policy.
+
+        Args:
+            policy: The first policy.
+
+        Returns:
+            The state.
+
+        Raises:
+            ValueError: If the policy does not fit the features, is not finite, or `cov_chol` is no Cholesky
+                factor; or if the archive has fewer samples than the policy has features and parameters.
+
+        Warns:
+            UserWarning: If the archive is too small for fits that can be trusted.
+        """
+        policy = _checked_policy("policy", policy, self.policy_features)
+        for field, values in policy._asdict().items():
+            checks.finite(f"policy.{field}", values, largest=checks.LARGEST)
+        theta_dim = policy.coef.shape[1]
+        self._check_archive_size(theta_dim)
+        archive = empty_archive(
+            self.archive_size, self.policy_features.context_dim, theta_dim, policy.coef.dtype
+        )
+        importance = self.importance
+        history = None if importance is None else empty_history(policy, importance.num_policies)
+        return CrepsState(policy, archive, jnp.zeros((), jnp.int32), history)
+
+    def ask(self, key: PRNGKey, state: CrepsState, contexts: ArrayLike) -> Array:
+        """Draw parameters from the policy.
+
+        Args:
+            key: Random key, of any implementation.
+            state: The state.
+            contexts: Contexts (n, s).
+
+        Returns:
+            Parameters theta (n, d).
+
+        Raises:
+            ValueError: If the state is of other features or of another archive size, or contexts or their
+                features are not finite.
+        """
+        key, state = threefry(checks.key("key", key)), self._checked_state(state)
+        contexts = self._checked_contexts(contexts, state.policy)
+        return self._checked_thetas(contexts, *self.programs.ask(key, state.policy, contexts))
+
+    def tell(self, state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
+        """Archive a batch, and fit a new policy to the archive.
+
+        A sample that holds NaN or infinity, such as a measurement that failed, or whose features do, takes its
+        place in the archive and is then ignored. The policy is kept until the archive holds as many valid
+        samples as the policy has features and parameters, p + d: fewer leave the covariance singular. It is
+        also kept where rewards do not differ after the baseline. Only a small program, which puts the batch
+        into the archive, is compiled anew for batches of another size.
+
+        Args:
+            state: The state.
+            batch: Contexts (n, s), parameters (n, d) and rewards (n,). Rewards of NumPy in float64 keep their
+                differences beside a large offset.
+
+        Returns:
+            The new state, and how the update went.
+
+        Raises:
+            ValueError: If shapes do not fit the features or the policy.
+
+        Warns:
+            UserWarning: If much of the difference of the rewards is lost in their rounding.
+        """
+        state = self._checked_state(state)
+        batch, reward_rest = _checked_batch(batch, state.archive)
+        state = state._replace(archive=self.programs.push(state.archive, batch, reward_rest))
+        return self.programs.update(self.kl_bound, state)
+
+    def mean(self, policy: LinearGaussian, contexts: ArrayLike) -> Array:
+        """Return the parameters theta (n, d) of contexts (n, s) under the policy without its exploration.
+
+        Raises:
+            ValueError: As `ask` does.
+        """
+        policy = _checked_policy("policy", policy, self.policy_features)
+        contexts = self._checked_contexts(contexts, policy)
+        return self._checked_thetas(contexts, *self.programs.mean(policy, contexts))
+
+    @functools.cached_property
+    def programs(self) -> "Programs":
+        """The compiled programs of these settings."""
+        settings = dataclasses.replace(self, kl_bound=0.0)
+        identity = tuple(getattr(settings, field.name) for field in dataclasses.fields(settings))
+        try:
+            found = _PROGRAMS.get(identity)
+        except TypeError:  # a user's features that cannot be hashed: nothing to share
+            return Programs(settings)
+        if found is None:
+            found = _PROGRAMS[identity] = Programs(settings)
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the settings alone: programs are compiled anew where they are needed."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    def _check_archive_size(self, theta_dim: int) -> None:
+        num_fitted = self.policy_features.size + theta_dim
+        if self.archive_size < num_fitted:
+            raise ValueError(
+                f"archive_size must be at least {num_fitted}, features and parameters, "
+                f"got {self.archive_size}"
+            )
+        enough = _ENOUGH_SAMPLES * num_fitted
+        if self.archive_size < enough:
+            warnings.warn(
+                f"archive_size should be at least {enough}, {_ENOUGH_SAMPLES} samples for each of "
+                f"{self.policy_features.size} features and {theta_dim} parameters, got {self.archive_size}: "
+                "the policy will learn slowly, or from chance",
+                stacklevel=3,
+            )
+
+    def _checked_contexts(self, contexts: ArrayLike, policy: LinearGaussian) -> Array:
+        shape = ("n", self.policy_features.context_dim)
+        contexts = checks.array("contexts", contexts, shape)
+        return checks.finite("contexts", _converted(contexts, policy.coef.dtype))
+
+    def _checked_thetas(self, contexts: Array, thetas: Array, is_finite: Array) -> Array:
+        if not isinstance(is_finite, Tracer) and not np.all(is_finite):
+            context = np.asarray(contexts)[~np.asarray(is_finite)][0]
+            features = np.asarray(self.policy_features.apply(jnp.asarray(context)))
+            raise ValueError(
+                f"policy_features.apply(context) must be finite, got {features} for context {context}"
+            )
+        return thetas
+
+    def _checked_state(self, state: CrepsState) -> CrepsState:
+        """Return a state after checking that it is one of this algorithm."""
+        checks.instance("state", state, CrepsState)
+        policy = _checked_policy("state.policy", state.policy, self.policy_features)
+        checks.instance("state.archive", state.archive, Archive)
+        context, theta, reward = state.archive.batch
+        if jnp.shape(reward) != (self.archive_size,):
+            raise ValueError(
+                f"state.archive must have the {self.archive_size} slots of archive_size, "
+                f"got {jnp.shape(reward)}"
+            )
+        checks.array("state.archive.batch.context", context, ("L", self.policy_features.context_dim))
+        checks.array("state.archive.batch.theta", theta, ("L", policy.coef.shape[1]))
+        expected = 0 if self.importance is None else self.importance.num_policies
+        got = 0 if state.history is None else state.history.coef.shape[0]
+        if got != expected:
+            raise ValueError(f"the state must hold the last {expected} policies, as `init` makes it, got {got}")
+        return state._replace(policy=policy)
+
+
+class Programs:
+    """Compiled programs of one algorithm; `others` holds those that are made of it, such as iterations."""
+
+    def __init__(self, settings: Creps):
+        """Compile nothing yet."""
+        self.ask = jax.jit(partial(_ask, settings))
+        self.push = jax.jit(push)
+        self.update = jax.jit(partial(_update, settings))
+        self.mean = jax.jit(partial(_mean, settings))
+        self.others: dict[Any, Any] = {}
+
+
+_PROGRAMS: weakref.WeakValueDictionary[tuple, Programs] = weakref.WeakValueDictionary()
+"""The programs of all algorithms that are alive, by their settings."""
 
 
 @checks.arguments
@@ -100,125 +276,163 @@ def creps(
     policy_features: FeatureMap,
     baseline_features: FeatureMap,
     *,
-    kl_bound: float | int = 0.5,
+    kl_bound: ScalarLike = 0.5,
     archive_size: int,
     ridge: float | int = 1e-4,
     m_step: MStep = weighted_ml,
     importance: Importance | None = None,
+    significance: float | int | None = 0.1,
 ) -> Creps:
     """Set up contextual relative entropy policy search.
 
     Args:
         policy_features: Features varphi(s) that the policy's mean is linear in.
         baseline_features: Features phi(s) whose expectations over the contexts are kept.
-        kl_bound: Largest relative entropy epsilon of one update, in nats.
-        archive_size: Number L of the last samples that are learned from.
+        kl_bound: Largest relative entropy epsilon of one update, in nats. Nothing is compiled anew for another
+            one; where it is traced and not above zero, the policy is kept.
+        archive_size: Number L of the last samples that are learned from. At least three for each feature and
+            parameter; fewer are warned of.
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale.
         m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's, goes wherever
             they lead; `bounded_ml()` keeps mean and covariance from moving too far at once.
         importance: Weigh archived samples by how likely they are today over how likely they were when drawn
             (`Importance()`); by default all count equally, as in the paper. The weights are those of samples
             that were drawn by `ask`.
+        significance: The p-value from which on the covariance stays as it is: below, it moves the share
+            `1 - p_value / significance` of the way to the fitted one. None moves it all the way whatever the
+            evidence, as in the paper, and loses the exploration to noise.
 
     Returns:
-        The functions `init`, `ask`, `tell` and `mean`. These raise ValueError, showing what they
-        got and what they expected, if shapes do not fit the features or the policy, if contexts to ask
-        for or a policy are not finite, or if `cov_chol` is no Cholesky factor.
+        The algorithm, with the functions `init`, `ask`, `tell` and `mean`.
 
     Raises:
         ValueError: If a setting is out of its range, or the features are of different contexts.
 
     Source: Abdolmaleki et al. 2016, Section 3.1.
     """
-    _check_settings(policy_features, baseline_features, kl_bound, ridge)
+    _check_settings(policy_features, baseline_features, ridge, significance)
+    checks.number("kl_bound", kl_bound, above=0.0)
     checks.function("m_step", m_step, "(policy, samples, *, ridge, scale) -> policy")
     if m_step is bounded_ml:
         raise ValueError(
             "m_step must be an M-step, such as bounded_ml(), got bounded_ml without its parentheses"
         )
-    context_dim = policy_features.context_dim
-    scale = None if policy_features.scale is None else jnp.asarray(policy_features.scale, jnp.float32)
+    return Creps(
+        policy_features=policy_features,
+        baseline_features=baseline_features,
+        kl_bound=kl_bound,
+        archive_size=archive_size,
+        ridge=ridge,
+        m_step=m_step,
+        importance=importance,
+        significance=significance,
+    )
 
-    def init(policy: LinearGaussian) -> CrepsState:
-        policy = _checked_policy("policy", policy, policy_features)
-        for field, values in policy._asdict().items():
-            checks.finite(f"policy.{field}", values, largest=checks.LARGEST)
-        theta_dim = policy.coef.shape[1]
-        least = policy_features.size + theta_dim
-        if archive_size < least:
-            raise ValueError(
-                f"archive_size must be at least {least}, features and parameters, got {archive_size}"
-            )
-        archive = empty_archive(archive_size, context_dim, theta_dim)
-        history = None if importance is None else empty_history(policy, importance.num_policies)
-        return CrepsState(policy, archive, jnp.zeros((), jnp.int32), history)
 
-    # Compiled here, as ask and tell are called by hand where a robot is real.
-    @jax.jit
-    def compiled_ask(key: PRNGKey, state: CrepsState, contexts: Array) -> Float[Array, "n d"]:
-        keys = jax.random.split(key, contexts.shape[0])
-        features = _features_of("policy_features", policy_features, contexts)
-        return jax.vmap(gaussian.sample, (0, None, 0))(keys, state.policy, features)
+def _ask(
+    settings: Creps, key: PRNGKey, policy: LinearGaussian, contexts: Array
+) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
+    """Draw parameters, and tell where features are finite."""
+    keys = jax.random.split(key, contexts.shape[0])
+    features = _features_of("policy_features", settings.policy_features, contexts)
+    return jax.vmap(gaussian.sample, (0, None, 0))(keys, policy, features), _are_finite(features)
 
-    @jax.jit
-    def compiled_tell(state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
-        archive = push(state.archive, batch)
-        is_valid = valid(archive)
-        # What is left out must not enter: 0 * nan is not 0.
-        samples = jax.tree.map(lambda x: jnp.where(_along(is_valid, x), x, 0.0), archive.batch)
 
-        features = _features_of("policy_features", policy_features, samples.context)
-        if importance is not None:
-            is_valid = is_valid & (archive.age < importance.num_policies)
-        prior, history = _prior(state, importance, features, samples.theta, archive.age, is_valid)
+def _mean(
+    settings: Creps, policy: LinearGaussian, contexts: Array
+) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
+    features = _features_of("policy_features", settings.policy_features, contexts)
+    return jax.vmap(gaussian.mean, (None, 0))(policy, features), _are_finite(features)
 
-        baseline = _features_of("baseline_features", baseline_features, samples.context)
-        dual = solve_dual(samples.reward, baseline, prior, kl_bound=kl_bound)  # Eq. (13)
-        weights = sample_weights(dual, samples.reward, baseline, prior)
-        weighted = WeightedSamples(features, samples.theta, weights, is_valid)
-        fitted = m_step(state.policy, weighted, ridge=ridge, scale=scale)  # Eq. (14), (15)
-        _check_fitted(fitted, state.policy)
 
-        num_valid = jnp.sum(is_valid, dtype=jnp.int32)
-        is_finite = jnp.all(jnp.isfinite(fitted.coef)) & jnp.all(jnp.isfinite(fitted.cov_chol))
-        is_usable = is_finite & jnp.all(jnp.diagonal(fitted.cov_chol) > 0)
-        is_updated = is_usable & (num_valid >= sum(state.policy.coef.shape))
-        policy = jax.tree.map(lambda new, old: jnp.where(is_updated, new, old), fitted, state.policy)
+class _Samples(NamedTuple):
+    """The archive as an update sees it; what does not count is zero."""
 
-        info = CrepsInfo(
-            dual=dual,
-            kl=sample_kl(weights, prior),
-            policy_kl=_mean_kl(policy, state.policy, features, is_valid),
-            effective_samples=_effective_samples(weights),
-            prior_effective_samples=_effective_samples(prior),
-            entropy=gaussian.entropy(policy),
-            num_valid=num_valid,
-            is_updated=is_updated,
-        )
-        return CrepsState(policy, archive, state.iteration + 1, history), info
+    weighted: WeightedSamples
+    baseline: Array
+    reward: Array
+    reward_resolution: Array
+    prior: Array
 
-    @jax.jit
-    def compiled_mean(policy: LinearGaussian, contexts: Array) -> Float[Array, "n d"]:
-        features = _features_of("policy_features", policy_features, contexts)
-        return jax.vmap(gaussian.mean, (None, 0))(policy, features)
 
-    # Checked outside of what is compiled, where values can be seen.
-    def checked_contexts(contexts: ArrayLike) -> Array:
-        return checks.finite("contexts", _float32(checks.array("contexts", contexts, ("n", context_dim))))
+def _update(settings: Creps, kl_bound: ScalarLike, state: CrepsState) -> tuple[CrepsState, CrepsInfo]:
+    """Fit a new policy to the archive."""
+    samples, history = _samples(settings, state)
+    (features, theta, _, is_valid), prior = samples.weighted, samples.prior
+    given = samples.reward, samples.baseline, prior
+    dual = solve_dual(*given, kl_bound=kl_bound, resolution=samples.reward_resolution)  # Eq. 13
+    weights = sample_weights(dual, *given)
+    weighted = samples.weighted._replace(weights=weights)
+    scale = settings.policy_features.scale
+    scale = None if scale is None else jnp.asarray(scale, theta.dtype)
+    fitted = settings.m_step(state.policy, weighted, ridge=settings.ridge, scale=scale)  # Eq. 14, 15
+    _check_fitted(fitted, state.policy)
 
-    def ask(key: PRNGKey, state: CrepsState, contexts: ArrayLike) -> Array:
-        key, state = checks.key("key", key), _checked_state(state, policy_features)
-        return compiled_ask(key, state, checked_contexts(contexts))
+    p_value = independence_p_value(weights, prior, features, theta)
+    if settings.significance is not None:
+        share = share_of_evidence(p_value, settings.significance)
+        cov_chol = blended_cov_chol(state.policy.cov_chol, fitted.cov_chol, share)
+        fitted = fitted._replace(cov_chol=cov_chol)
 
-    def tell(state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
-        state = _checked_state(state, policy_features)
-        return compiled_tell(state, _checked_batch(batch, state.archive))
+    num_valid = jnp.sum(is_valid, dtype=jnp.int32)
+    is_updated = _is_usable(fitted) & (num_valid >= sum(state.policy.coef.shape)) & dual.is_informative
+    policy = jax.tree.map(lambda new, old: jnp.where(is_updated, new, old), fitted, state.policy)
+    entropy = gaussian.entropy(policy)
+    loss = jnp.maximum(gaussian.entropy(state.policy) - entropy, 0.0)
+    spread = jnp.max(jnp.where(is_valid, jnp.abs(samples.reward), 0.0))
+    info = CrepsInfo(
+        dual=dual,
+        kl=sample_kl(weights, prior),
+        policy_kl=jnp.where(is_updated, _mean_kl(policy, state.policy, features, is_valid), 0.0),
+        effective_samples=_effective_samples(weights),
+        prior_effective_samples=_effective_samples(prior),
+        entropy=entropy,
+        num_valid=num_valid,
+        is_updated=is_updated,
+        p_value=p_value,
+        unsupported_loss=p_value * loss,
+        reward_rounding=jnp.minimum(samples.reward_resolution / jnp.where(spread > 0, spread, 1.0), 1.0),
+    )
+    return CrepsState(policy, state.archive, state.iteration + 1, history), info
 
-    def mean(policy: LinearGaussian, contexts: ArrayLike) -> Array:
-        policy = _checked_policy("policy", policy, policy_features)
-        return compiled_mean(policy, checked_contexts(contexts))
 
-    return Creps(init, ask, tell, mean)
+def _samples(settings: Creps, state: CrepsState) -> tuple[_Samples, PolicyHistory | None]:
+    """Return what an update is made from, and the history with the policy of this iteration."""
+    archive = state.archive
+    context, theta, _ = archive.batch
+    features = _features_of("policy_features", settings.policy_features, context)
+    baseline = _features_of("baseline_features", settings.baseline_features, context)
+    is_valid = archive.is_valid & _are_finite(features) & _are_finite(baseline)
+    if settings.importance is not None:
+        is_valid = is_valid & (archive.age < settings.importance.num_policies)
+    archive = archive._replace(is_valid=is_valid)
+    # What is left out must not enter: 0 * nan is not 0.
+    features, theta, baseline = (jnp.where(is_valid[:, None], x, 0.0) for x in (features, theta, baseline))
+    prior, history = _prior(settings.importance, state, archive, features)
+    reward, resolution = centred_reward(archive)
+    weighted = WeightedSamples(features, theta, prior, is_valid)
+    return _Samples(weighted, baseline, reward, resolution, prior), history
+
+
+def _prior(
+    importance: Importance | None, state: CrepsState, archive: Archive, features: Array
+) -> tuple[Array, PolicyHistory | None]:
+    """Return how much each sample counts before rewards are looked at, and the history with this policy."""
+    is_valid, theta = archive.is_valid, archive.batch.theta
+    if importance is None or state.history is None:
+        return is_valid.astype(theta.dtype), None
+    policy, iteration = state.policy, state.iteration
+    history = remember(state.history, policy, iteration)
+    least = importance.least_effective
+    weights = importance_weights(
+        policy, history, features, theta, archive.age, is_valid, iteration, least_effective=least
+    )
+    return weights, history
+
+
+def _is_usable(policy: LinearGaussian) -> Bool[Array, ""]:
+    is_finite = jnp.all(jnp.isfinite(policy.coef)) & jnp.all(jnp.isfinite(policy.cov_chol))
+    return is_finite & jnp.all(jnp.diagonal(policy.cov_chol) > 0)
 
 
 def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array, is_valid: Array) -> Scalar:
@@ -236,26 +450,25 @@ def _effective_samples(weights: Array) -> Scalar:
     return jnp.sum(weights) ** 2 / jnp.where(squares > 0, squares, 1.0)
 
 
-def _along(mask: Array, array: Array) -> Array:
-    """Give a mask of samples the number of axes of an array of samples."""
-    return mask.reshape(mask.shape + (1,) * (array.ndim - 1))
-
-
 def _features_of(name: str, features: FeatureMap, contexts: Array) -> Array:
     def apply(context: Array) -> Array:
-        return checks.array(f"{name}.apply(context)", features.apply(context), (features.size,))
+        values = checks.array(f"{name}.apply(context)", features.apply(context), (features.size,))
+        return _converted(values, contexts.dtype)
 
     return jax.vmap(apply)(contexts)
 
 
-def _float32(values: Array) -> Array:
-    """Convert to float32; what has that type is returned as it is, as even an idle conversion takes time."""
-    is_float32 = values.dtype == jnp.float32 and not values.weak_type
-    return values if is_float32 else values.astype(jnp.float32)
+def _are_finite(rows: Array) -> Bool[Array, " n"]:
+    return jnp.all(jnp.isfinite(rows), axis=1)
+
+
+def _converted(values: Array, dtype: jnp.dtype) -> Array:
+    """Convert an array; what has that type is returned as it is, as even an idle conversion takes time."""
+    return values if values.dtype == dtype and not values.weak_type else values.astype(dtype)
 
 
 def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> LinearGaussian:
-    """Return a policy in float32 after checking that it fits the features, and what is not traced of it."""
+    """Return a policy in one precision after checking that it fits the features, and what is not traced of it."""
     checks.instance(name, policy, LinearGaussian)
     coef, cov_chol = (
         checks.array(f"{name}.coef", policy.coef),
@@ -271,7 +484,8 @@ def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> 
             f"the {name} must have coef ({features.size}, d), a row for each of the policy features, "
             f"and cov_chol (d, d), got {coef.shape} and {cov_chol.shape}"
         )
-    policy = LinearGaussian(_float32(coef), _float32(cov_chol))
+    dtype = jnp.promote_types(coef.dtype, cov_chol.dtype)
+    policy = LinearGaussian(_converted(coef, dtype), _converted(cov_chol, dtype))
     for field, values in policy._asdict().items():
         checks.finite(f"{name}.{field}", values)
     if not isinstance(policy.cov_chol, Tracer):
@@ -283,25 +497,46 @@ def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> 
     return policy
 
 
-def _checked_state(state: CrepsState, features: FeatureMap) -> CrepsState:
-    """Return a state, its policy in float32, after checking that it is one of these features."""
-    checks.instance("state", state, CrepsState)
-    policy = _checked_policy("state.policy", state.policy, features)
-    checks.instance("state.archive", state.archive, Archive)
-    context, theta, _ = state.archive.batch
-    checks.array("state.archive.batch.context", context, ("L", features.context_dim))
-    checks.array("state.archive.batch.theta", theta, ("L", policy.coef.shape[1]))
-    return state._replace(policy=policy)
-
-
-def _checked_batch(batch: Batch, archive: Archive) -> Batch:
+def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | None]:
+    """Return a batch in the precision of the archive, and the rest of more precise rewards."""
     checks.instance("batch", batch, Batch)
-    reward = checks.array("batch.reward", batch.reward, ("n",))
+    reward = _given_reward(batch.reward)
+    dtype = archive.batch.theta.dtype
     num, context_dim = reward.shape[0], archive.batch.context.shape[1]
     theta_dim, note = archive.batch.theta.shape[1], f" beside batch.reward {reward.shape}"
     context = checks.array("batch.context", batch.context, (num, context_dim), note=note)
     theta = checks.array("batch.theta", batch.theta, (num, theta_dim), note=note)
-    return Batch(*map(_float32, (context, theta, reward)))
+    _warn_of_coarse_rewards(reward)
+    reward, rest = split_reward(reward, dtype)
+    batch = Batch(_converted(context, dtype), _converted(theta, dtype), jnp.asarray(reward))
+    return batch, None if rest is None else jnp.asarray(rest)
+
+
+def _given_reward(reward: ArrayLike) -> Array | np.ndarray:
+    """Return rewards (n,) in the precision in which they were given: jax would narrow those of NumPy."""
+    checked = checks.array("batch.reward", reward, ("n",))
+    if isinstance(reward, jax.Array):
+        return checked
+    values = np.asarray(reward)
+    return np.asarray(checked) if values.dtype == np.float32 else values.astype(np.float64)
+
+
+def _warn_of_coarse_rewards(reward: Array | np.ndarray) -> None:
+    """Warn where rounding takes much of the differences of rewards, unless these are traced."""
+    if isinstance(reward, Tracer):
+        return
+    values = np.asarray(reward)
+    values = values[np.isfinite(values)]
+    if values.size == 0:
+        return
+    with np.errstate(over="ignore"):
+        step, spread = np.spacing(np.abs(values).max()), values.max() - values.min()
+    if 0 < spread and _COARSE_REWARDS * spread < step:
+        warnings.warn(
+            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where {values.dtype} has steps of "
+            f"{step:.3g}: tell rewards in float64, or without their common offset",
+            stacklevel=4,
+        )
 
 
 def _check_fitted(fitted: LinearGaussian, policy: LinearGaussian) -> None:
@@ -310,34 +545,11 @@ def _check_fitted(fitted: LinearGaussian, policy: LinearGaussian) -> None:
         checks.array(f"{field} of what m_step returns", getattr(fitted, field), values.shape)
 
 
-def _prior(
-    state: CrepsState,
-    importance: Importance | None,
-    features: Array,
-    theta: Array,
-    age: Array,
-    is_valid: Array,
-) -> tuple[Array, PolicyHistory | None]:
-    """Return how much each sample counts before rewards are looked at, and the history with this policy."""
-    expected = 0 if importance is None else importance.num_policies
-    got = 0 if state.history is None else state.history.coef.shape[0]
-    if got != expected:
-        raise ValueError(f"the state must hold the last {expected} policies, as `init` makes it, got {got}")
-    if importance is None or state.history is None:
-        return is_valid.astype(jnp.float32), None
-    policy, iteration = state.policy, state.iteration
-    history = remember(state.history, policy, iteration)
-    weights = importance_weights(
-        policy, history, features, theta, age, is_valid, iteration, least_effective=importance.least_effective
-    )
-    return weights, history
-
-
 def _check_settings(
     policy_features: FeatureMap,
     baseline_features: FeatureMap,
-    kl_bound: float | int,
     ridge: float | int,
+    significance: float | int | None,
 ) -> None:
     _check_features("policy_features", policy_features)
     _check_features("baseline_features", baseline_features)
@@ -346,8 +558,9 @@ def _check_settings(
             "policy_features and baseline_features must be of the same context, got "
             f"{policy_features.context_dim} and {baseline_features.context_dim} variables"
         )
-    checks.number("kl_bound", kl_bound, above=0.0)
     checks.number("ridge", ridge, least=0.0)
+    if significance is not None and not 0 < checks.number("significance", significance) <= 1:
+        raise ValueError(f"significance must be above 0 and at most 1, or None, got {significance}")
 
 
 def _check_features(name: str, features: FeatureMap) -> None:

@@ -1,5 +1,6 @@
 """Roll out a batch of parameters for a task, shared out over devices, and see to failures."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
@@ -16,6 +17,7 @@ from creps_jax.typing import Array, Bool, Float, PRNGKey
 
 __all__ = [
     "Devices",
+    "compiled_roll_out",
     "device_tuple",
     "from_host",
     "mean_outcome",
@@ -49,7 +51,6 @@ def device_tuple(devices: Devices) -> ChosenDevices:
     return given
 
 
-@partial(jax.jit, static_argnums=(0, 1))
 def roll_out(
     task: Task,
     devices: ChosenDevices,
@@ -81,8 +82,19 @@ def roll_out(
         rollouts = _shared_out(rollouts, devices)
     outcomes = rollouts(keys, contexts, thetas)
     is_failed = ~jnp.isfinite(outcomes.reward)
-    reward = jnp.where(is_failed, jnp.float32(task.worst_reward), outcomes.reward.astype(jnp.float32))
+    given = outcomes.reward.dtype
+    is_float = jnp.issubdtype(given, jnp.floating) and given.itemsize >= 4
+    reward = outcomes.reward.astype(given if is_float else jnp.float32)
+    reward = jnp.where(is_failed, jnp.asarray(task.worst_reward, reward.dtype), reward)
     return outcomes._replace(reward=reward), is_failed
+
+
+def compiled_roll_out(task: Task, devices: ChosenDevices) -> Callable:
+    """Return `roll_out` of a task over devices, compiled: (key, contexts, thetas). The task keeps it."""
+    if devices not in task.programs:
+        # A copy: the program must not keep alive the task that keeps it.
+        task.programs[devices] = jax.jit(partial(roll_out, dataclasses.replace(task), devices))
+    return task.programs[devices]
 
 
 def replicate(tree: Any, devices: ChosenDevices) -> Any:

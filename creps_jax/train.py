@@ -4,6 +4,7 @@ Every random number of a run follows from its key and the number of the iteratio
 loop and a resumed run draw the same ones. Rollouts are shared out over the devices.
 """
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -21,6 +22,7 @@ from creps_jax.keys import threefry
 from creps_jax.policy import LinearGaussian
 from creps_jax.rollouts import (
     Devices,
+    compiled_roll_out,
     device_tuple,
     from_host,
     mean_outcome,
@@ -30,7 +32,7 @@ from creps_jax.rollouts import (
     spread_rows,
 )
 from creps_jax.tasks.base import Task
-from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
+from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar, ScalarLike
 
 __all__ = ["IterationLog", "Samples", "evaluate", "make_iteration", "train", "train_trials"]
 
@@ -85,12 +87,13 @@ def make_iteration(
 
     Source: Abdolmaleki et al. 2016, Algorithm 1.
     """
-    setup = _make_setup(task, algorithm, samples, devices)
+    setup = _Setup(task, samples, device_tuple(devices))
+    iterate = _program(algorithm, _iterate, setup)
 
     @checks.arguments
     def iteration(key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
         key, state = replicate((key, _checked_state("state", state)), setup.devices)
-        return _iterate(setup, key, state)
+        return iterate(algorithm.kl_bound, key, state)
 
     return iteration
 
@@ -132,10 +135,10 @@ def train(
     """
     _check_callback(on_iteration)
     state = _checked_start(start) if isinstance(start, CrepsState) else algorithm.init(start)
-    phases = _phases(task, algorithm, state, iterations, samples, first_samples, devices)
+    phases = _phases(task, state, iterations, samples, first_samples, devices)
     chosen = phases[0][0].devices
     key, state = replicate((key, state), chosen)
-    state, logs = _run(_iterate, phases, key, state, on_iteration)
+    state, logs = _run(algorithm, _iterate, phases, key, state, on_iteration)
     return state, from_host(logs, chosen)
 
 
@@ -185,13 +188,13 @@ def train_trials(
         raise ValueError(
             f"start must have one state for each of {num_trials} keys, got {jnp.shape(states.iteration)}"
         )
-    phases = _phases(task, algorithm, states, iterations, samples, first_samples, devices)
+    phases = _phases(task, states, iterations, samples, first_samples, devices)
     setup = phases[0][0]
     if _shares_trials(setup, num_trials):
         keys, states = spread_rows((keys, states), setup.devices)
     else:
         keys, states = replicate((keys, states), setup.devices)
-    states, logs = _run(_iterate_trials, phases, keys, states, on_iteration)
+    states, logs = _run(algorithm, _iterate_trials, phases, keys, states, on_iteration)
     return states, from_host(jax.tree.map(lambda x: np.swapaxes(x, 0, 1), logs), setup.devices)
 
 
@@ -231,26 +234,42 @@ def evaluate(
     chosen = device_tuple(devices)
     key, contexts, thetas = replicate((key, contexts, thetas), chosen)
     contexts, thetas = (jnp.repeat(x, repeats, axis=0) for x in (contexts, thetas))
-    outcomes, _ = roll_out(task, chosen, key, contexts, thetas)
+    outcomes, _ = compiled_roll_out(task, chosen)(key, contexts, thetas)
     return jax.tree.map(lambda x: x.reshape(num, repeats, *x.shape[1:]), outcomes)
 
 
 class _Setup(NamedTuple):
-    """What an iteration is compiled for; hashable, so that equal setups share one compilation."""
+    """What an iteration is compiled for besides the algorithm; hashable."""
 
     task: Task
-    algorithm: Creps
     samples: int
     devices: tuple[jax.Device, ...]
 
 
-def _make_setup(task: Task, algorithm: Creps, samples: int, devices: Devices) -> _Setup:
-    return _Setup(task, algorithm, samples, device_tuple(devices))
+Iterate = Callable[[_Setup, Creps, PRNGKey, CrepsState], tuple[CrepsState, IterationLog]]
 
 
-@partial(jax.jit, static_argnums=0)
-def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
-    task, algorithm, samples, devices = setup
+def _program(algorithm: Creps, function: Callable, *static: Any) -> Callable:
+    """Return `function(*static, algorithm, key, state)`, compiled as (KL bound, key, state) -> results.
+
+    Programs live as long as the algorithms of the same settings, which share them whatever their KL bounds.
+    """
+    programs = algorithm.programs.others
+    if (function, *static) not in programs:
+        # A copy: the program must not keep alive the algorithm that keeps it.
+        settings = dataclasses.replace(algorithm, kl_bound=0.0)
+
+        def program(kl_bound: ScalarLike, key: Array, state: CrepsState) -> Any:
+            return function(*static, dataclasses.replace(settings, kl_bound=kl_bound), key, state)
+
+        programs[(function, *static)] = jax.jit(program)
+    return programs[(function, *static)]
+
+
+def _iterate(
+    setup: _Setup, algorithm: Creps, key: PRNGKey, state: CrepsState
+) -> tuple[CrepsState, IterationLog]:
+    task, samples, devices = setup
     _check_fit(task, state)
     # The barriers keep the compiler from fusing an iteration with what surrounds it, which rounds
     # differently in a scan and on its own.
@@ -270,12 +289,13 @@ def _iterate(setup: _Setup, key: PRNGKey, state: CrepsState) -> tuple[CrepsState
     return lax.optimization_barrier((state, log))
 
 
-@partial(jax.jit, static_argnums=0)
-def _iterate_trials(setup: _Setup, keys: Array, states: CrepsState) -> tuple[CrepsState, IterationLog]:
+def _iterate_trials(
+    setup: _Setup, algorithm: Creps, keys: Array, states: CrepsState
+) -> tuple[CrepsState, IterationLog]:
     if not _shares_trials(setup, keys.shape[0]):
-        return jax.vmap(partial(_iterate, setup))(keys, states)
+        return jax.vmap(partial(_iterate, setup, algorithm))(keys, states)
     alone = setup._replace(devices=setup.devices[:1])
-    return share_rows(jax.vmap(partial(_iterate, alone)), setup.devices)(keys, states)
+    return share_rows(jax.vmap(partial(_iterate, alone, algorithm)), setup.devices)(keys, states)
 
 
 def _sample_context(task: Task, key: PRNGKey) -> Array:
@@ -291,10 +311,11 @@ def _shares_trials(setup: _Setup, num_trials: int) -> bool:
     return len(setup.devices) > 1 and num_processes == 1 and num_trials % len(setup.devices) == 0
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
-def _scan(iterate: Callable, setup: _Setup, length: int, key: Array, state: CrepsState):
+def _scan(
+    iterate: Iterate, setup: _Setup, length: int, algorithm: Creps, key: Array, state: CrepsState
+) -> tuple[CrepsState, IterationLog]:
     def step(state: CrepsState, _: None) -> tuple[CrepsState, IterationLog]:
-        state, log = iterate(setup, key, state)
+        state, log = iterate(setup, algorithm, key, state)
         return state, log._replace(samples=None)
 
     return lax.scan(step, state, length=length)
@@ -302,7 +323,6 @@ def _scan(iterate: Callable, setup: _Setup, length: int, key: Array, state: Crep
 
 def _phases(
     task: Task,
-    algorithm: Creps,
     state: CrepsState,
     iterations: int,
     samples: int,
@@ -310,7 +330,7 @@ def _phases(
     devices: Devices,
 ) -> list[tuple[_Setup, int]]:
     """List with how many samples to run how many iterations."""
-    ordinary = _make_setup(task, algorithm, samples, devices)
+    ordinary = _Setup(task, samples, device_tuple(devices))
     is_begun = np.any(np.asarray(state.iteration) > 0)
     if first_samples is None or is_begun:
         return [(ordinary, iterations)]
@@ -319,7 +339,8 @@ def _phases(
 
 
 def _run(
-    iterate: Callable,
+    algorithm: Creps,
+    iterate: Iterate,
     phases: list[tuple[_Setup, int]],
     key: Array,
     state: CrepsState,
@@ -329,11 +350,13 @@ def _run(
     logs = []
     for setup, length in phases:
         if on_iteration is None and length > 1:
-            state, log = _scan(iterate, setup, length, key, state)
+            scan = _program(algorithm, _scan, iterate, setup, length)
+            state, log = scan(algorithm.kl_bound, key, state)
             logs.append(jax.device_get(log))
             continue
+        program = _program(algorithm, iterate, setup)
         for _ in range(length):
-            state, log = iterate(setup, key, state)
+            state, log = program(algorithm.kl_bound, key, state)
             logs.append(jax.tree.map(lambda x: x[None], jax.device_get(log._replace(samples=None))))
             if on_iteration is not None:
                 on_iteration(state, log)

@@ -5,6 +5,7 @@ outcome. Everything is written for one rollout; the caller vmaps.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -80,6 +81,15 @@ class Task:
         checks.count("theta_dim", self.theta_dim)
         # An array could not be compiled for.
         object.__setattr__(self, "worst_reward", checks.number("worst_reward", self.worst_reward))
+
+    @functools.cached_property
+    def programs(self) -> dict[Any, Any]:
+        """Compiled programs of this task, freed with it."""
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields alone: programs are compiled anew where they are needed."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
 def check_outcome(outcome: Any) -> Any:
