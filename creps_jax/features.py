@@ -1,10 +1,12 @@
-"""Make features of the context: linear, quadratic, normalised radial basis functions.
+"""Make features of the context: linear, quadratic, polynomial, normalised radial basis functions.
 
 What computes them is data, numbers in a record: equal settings give equal features, which can be copied and
 pickled.
 """
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -18,6 +20,7 @@ from creps_jax.typing import Array, Float, VectorLike
 __all__ = [
     "FeatureMap",
     "linear_features",
+    "polynomial_features",
     "quadratic_features",
     "rbf_features",
     "rbf_grid",
@@ -31,6 +34,8 @@ inverse of a bandwidth, which compiled programs multiply by, get too small."""
 _NARROW = 1e-9
 """Bandwidth, relative to the range, below which squares of distances can overflow. Centres are then a hundred
 bandwidths apart or more, so that only the nearest has a weight."""
+_MOST_FEATURES = 1_000_000
+"""The largest number of monomials: it grows fast, and a slip would fill the memory."""
 
 
 class FeatureMap(NamedTuple):
@@ -81,6 +86,34 @@ def quadratic_features(dim: int) -> FeatureMap:
     Source: Abdolmaleki et al. 2016, text below Eq. 11 and 15.
     """
     return FeatureMap(_Quadratic(dim), 2 * dim, dim)
+
+
+@checks.arguments
+def polynomial_features(dim: int, degree: int) -> FeatureMap:
+    """Make all monomials of the context variables up to a degree, products of several variables included.
+
+    The constant comes first, then the monomials by their degree; those of one degree in the order of
+    `itertools.combinations_with_replacement`: for s = (x, y) and degree 2 the features are
+    [1, x, y, x^2, x y, y^2].
+
+    Args:
+        dim: Number of context variables.
+        degree: The largest sum of the exponents in a monomial.
+
+    Returns:
+        The map to (dim + degree)! / (dim! degree!) features.
+
+    Raises:
+        ValueError: If `dim` or `degree` is below 1, or there are too many features; on `apply`, if a context
+            has another shape than (dim,).
+    """
+    # The number is not even computed where it has hundreds of digits or more.
+    size = math.inf if min(dim, degree) > 100 else math.comb(dim + degree, degree)
+    if size > _MOST_FEATURES:
+        raise ValueError(
+            f"dim and degree must leave at most {_MOST_FEATURES} features, got {dim} and {degree}"
+        )
+    return FeatureMap(_Polynomial(dim, degree), int(size), dim)
 
 
 def rbf_features(
@@ -157,6 +190,27 @@ class _Quadratic:
 
 
 @dataclasses.dataclass(frozen=True)
+class _Polynomial:
+    """Compute all monomials up to a degree."""
+
+    dim: int
+    degree: int
+
+    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
+        context = _checked_context(context, self.dim)
+        monomials = [jnp.ones_like(context[:1])]
+        rows: dict[tuple[int, ...], int] = {(): 0}
+        for degree in range(1, self.degree + 1):
+            # Each is one of the degree below times its last variable.
+            combinations = list(itertools.combinations_with_replacement(range(self.dim), degree))
+            factors = np.array([rows[variables[:-1]] for variables in combinations])
+            last = np.array([variables[-1] for variables in combinations])
+            monomials.append(_kept_finite(monomials[-1][factors] * context[last]))
+            rows = {variables: row for row, variables in enumerate(combinations)}
+        return jnp.concatenate(monomials)
+
+
+@dataclasses.dataclass(frozen=True)
 class _Radial:
     """Compute normalised radial basis functions."""
 
@@ -198,7 +252,7 @@ def _centers(low: np.ndarray, high: np.ndarray, num_centers: int) -> np.ndarray:
 
 
 def _kept_finite(features: Array) -> Array:
-    """Take what has overflowed for the largest number."""
+    """Take what has overflowed for the largest number: its product with zero is then a number too."""
     largest = float(jnp.finfo(features.dtype).max)
     return jnp.clip(features, -largest, largest)
 

@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+import math
 import pickle
 from functools import partial
 
@@ -12,6 +13,7 @@ import pytest
 
 from creps_jax.features import (
     linear_features,
+    polynomial_features,
     quadratic_features,
     rbf_features,
     rbf_grid,
@@ -20,6 +22,7 @@ from creps_jax.features import (
 MAPS = {
     "linear": linear_features(2),
     "quadratic": quadratic_features(2),
+    "polynomial": polynomial_features(2, 3),
     "radial": rbf_features((0.0, -1.0), (1.0, 3.0), 3),
 }
 
@@ -49,9 +52,41 @@ def test_linear_and_quadratic_by_hand():
     np.testing.assert_array_equal(quadratic_features(2).apply(context), [2, -3, 4, 9])
 
 
+@pytest.mark.parametrize("dim", [1, 2, 3, 5])
+@pytest.mark.parametrize("degree", [1, 2, 4])
+def test_polynomial_features_are_all_monomials(dim, degree):
+    features = polynomial_features(dim, degree)
+    assert features.size == math.comb(dim + degree, degree) and features.context_dim == dim
+    context = np.random.default_rng(dim).uniform(-2, 2, dim)
+    expected = [
+        math.prod(variables)
+        for total in range(degree + 1)
+        for variables in itertools.combinations_with_replacement(context.tolist(), total)
+    ]
+    assert expected[0] == 1
+    np.testing.assert_allclose(features.apply(jnp.float32(context)), expected, rtol=1e-5)
+
+
+def test_polynomial_features_by_hand():
+    x, y, z = 2.0, -3.0, 5.0
+    row = polynomial_features(3, 2).apply(jnp.array([x, y, z]))
+    np.testing.assert_array_equal(row, [1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])
+    np.testing.assert_array_equal(
+        polynomial_features(2, 1).apply(jnp.array([x, y])), linear_features(2).apply(jnp.array([x, y]))
+    )
+
+
+@pytest.mark.parametrize(("dim", "degree"), [(1000, 3), (3, 1000), (10**9, 10**9), (2, 2**31 - 1)])
+def test_too_many_monomials_are_refused(dim, degree):
+    with pytest.raises(ValueError, match=f"dim and degree must leave at most .*, got {dim} and {degree}"):
+        polynomial_features(dim, degree)
+
+
 MAKERS = {
     "linear": lambda: linear_features(2),
     "quadratic": lambda: quadratic_features(2),
+    "polynomial": lambda: polynomial_features(2, 2),
+    "polynomial of another degree": lambda: polynomial_features(2, 3),
     "radial": lambda: rbf_features((0.0, -1.0), (1.0, 3.0), 3),
     "radial of NumPy": lambda: rbf_features(np.array([0.0, -2.0]), jnp.array([1.0, 3.0]), 3),
     "radial of another width": lambda: rbf_features((0.0, -1.0), (1.0, 3.0), 3, bandwidth=0.2),
@@ -172,7 +207,7 @@ def test_radial_features_of_ordinary_settings_are_the_plain_formula_to_the_bit(l
         np.testing.assert_array_equal(transform(features.apply)(contexts), transform(plain)(contexts))
 
 
-@pytest.mark.parametrize("features", [quadratic_features(3)])
+@pytest.mark.parametrize("features", [quadratic_features(3), polynomial_features(3, 4)])
 def test_powers_stay_finite(features):
     numbers = [0.0, 1e-38, 1.0, 1e15, 1e20, LARGEST]
     contexts = jnp.float32(list(itertools.product([*numbers, -1e20], repeat=3)))
@@ -262,7 +297,9 @@ def test_bad_radial_settings_are_named(args, bandwidth, message):
         rbf_features(*args, bandwidth=bandwidth)
 
 
-@pytest.mark.parametrize("make", [linear_features, quadratic_features])
+@pytest.mark.parametrize(
+    "make", [linear_features, quadratic_features, partial(polynomial_features, degree=2)]
+)
 def test_bad_dimension_is_named(make):
     with pytest.raises(ValueError, match="dim must be at least 1, got 0"):
         make(0)
