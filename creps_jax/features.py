@@ -29,8 +29,8 @@ __all__ = [
 _FAR = 1e20
 """Distance from the range, in bandwidths, beyond which a context counts as that far: no overflow."""
 _LARGE = 1e30
-"""Size of the ends of a range from which the difference of a context and an end can overflow, and so can the
-inverse of a bandwidth, which compiled programs multiply by, get too small."""
+"""Size of the ends of a range from which differences can overflow, and the inverse of a bandwidth, which
+compiled programs multiply by, can be so small that they take it for zero."""
 _NARROW = 1e-9
 """Bandwidth, relative to the range, below which squares of distances can overflow. Centres are then a hundred
 bandwidths apart or more, so that only the nearest has a weight."""
