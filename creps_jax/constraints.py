@@ -13,7 +13,7 @@ from creps_jax.typing import Array, Float, ScalarLike, VectorLike
 __all__ = ["penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
 
 _WIDE = 1e37
-"""Width of a box from which it is computed in a larger unit."""
+"""Width of a box from which it, or its inverse, can be out of the range of float32."""
 
 
 def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) -> Float[Array, "*b d"]:
@@ -34,7 +34,8 @@ def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike)
     Source: Abdolmaleki et al. 2016, Eq. 17.
     """
     theta, low, high = _box(theta, low, high)
-    unit = _unit(low, high)
+    # Divided by a power of two, results are the same to the bit.
+    unit = jnp.where(high - low > _WIDE, 16.0, 1.0).astype(theta.dtype)
     gated = (low / unit + jax.nn.sigmoid(theta) * (high / unit - low / unit)) * unit
     # The clip takes back the last bit that rounding can put outside the box.
     return jnp.clip(gated, low, high)
@@ -58,11 +59,14 @@ def sigmoid_gate_inverse(
         ValueError: If bounds do not fit the parameters or each other, or a number is none.
     """
     theta, low, high = _box(theta, low, high)
-    unit = _unit(low, high)
-    theta, low, high = theta / unit, low / unit, high / unit
     width = high - low
-    is_free = width >= float(jnp.finfo(width.dtype).tiny)
+    is_wide = width > _WIDE
+    is_free = (width >= float(jnp.finfo(width.dtype).tiny)) & ~is_wide
     fraction = jnp.where(is_free, (theta - low) / jnp.where(is_free, width, 1.0), 0.5)
+    # Without the width of a wide box, which overflows: compiled programs take its inverse for zero.
+    inside = jnp.clip(theta, low, high)
+    below, above = 0.5 * inside - 0.5 * low, 0.5 * high - 0.5 * inside
+    fraction = jnp.where(is_wide, below / jnp.where(is_wide, below + above, 1.0), fraction)
     margin = float(jnp.finfo(theta.dtype).epsneg)
     return jax.scipy.special.logit(jnp.clip(fraction, margin, 1.0 - margin))
 
@@ -85,15 +89,6 @@ def penalty(violation: Float[Array, "*b c"], size: ScalarLike) -> Float[Array, "
     """
     is_violated = jnp.any(violation > 0.0, axis=-1)
     return jnp.where(is_violated, jnp.asarray(size, violation.dtype), jnp.zeros((), violation.dtype))
-
-
-def _unit(low: Array, high: Array) -> Array:
-    """Return what to divide wide boxes by, where a width or its inverse is beyond float32, and 1 elsewhere.
-
-    Divided by a power of two, results are the same to the bit. Compiled programs multiply by the inverse of a
-    width, and takes one that is too small for zero.
-    """
-    return jnp.where(high - low > _WIDE, 16.0, 1.0).astype(low.dtype)
 
 
 def _box(

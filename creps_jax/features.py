@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from creps_jax import checks
 from creps_jax.typing import Array, Float, VectorLike
@@ -227,14 +228,17 @@ class _Radial:
         width = np.where(is_narrow, high - low, width)
         # A power of two, so that results are the same to the bit where it is not needed.
         unit = np.where(np.maximum(np.abs(low), np.abs(high)) > _LARGE, 16.0, 1.0)
+        # Multiplied in another order, as compilers like to, extreme numbers overflow or become zero.
+        is_extreme = np.any(is_narrow | (unit > 1) | (width < 1 / checks.LARGEST) | (width > checks.LARGEST))
+        in_order = lax.optimization_barrier if is_extreme else lambda numbers: numbers
         low, high, width, centers, unit = (
             jnp.asarray(numbers, context.dtype)
             for numbers in (low / unit, high / unit, width / unit, centers / unit, unit)
         )
-        context = context / unit
+        context = in_order(context / unit)
         nearest = jnp.clip(context, low, high)
-        inside = (nearest[None, :] - centers) / width[None, :]
-        outside = jnp.clip((context - nearest) / width, -_FAR, _FAR)
+        inside = in_order((nearest[None, :] - centers) / width[None, :])
+        outside = in_order(jnp.clip((context - nearest) / width, -_FAR, _FAR))
         # (s - c)^2 / 2 sigma^2 less the term all centres share, which far outside would drown the others.
         costs = 0.5 * inside**2 + outside[None, :] * inside
         if is_narrow.any():

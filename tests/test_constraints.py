@@ -112,8 +112,6 @@ def test_gate_of_an_extreme_box_stays_inside(low, high, call):
     # What is below the smallest ordinary number counts as zero.
     size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
     assert (np.abs(gated - expected) <= 1e-6 * size + 1.2e-38).all()
-    gradient = jax.jit(jax.grad(lambda theta: jnp.sum(sigmoid_gate(theta, low, high) / np.float32(4e38 / 2))))
-    assert np.isfinite(gradient(theta)).all()
 
 
 @boxes
