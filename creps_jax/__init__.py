@@ -8,7 +8,13 @@ from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
 from creps_jax.creps import Creps, CrepsInfo, CrepsState, creps
 from creps_jax.dual import DualSolution, sample_weights, solve_dual
-from creps_jax.features import FeatureMap, linear_features, quadratic_features, rbf_features
+from creps_jax.features import (
+    FeatureMap,
+    linear_features,
+    polynomial_features,
+    quadratic_features,
+    rbf_features,
+)
 from creps_jax.importance import Importance
 from creps_jax.linalg import thomas_solve
 from creps_jax.motion.nao_kinematics import leg_fk, leg_ik
@@ -58,6 +64,7 @@ __all__ = [
     "make_iteration",
     "nao_walk",
     "penalised",
+    "polynomial_features",
     "quadratic_features",
     "rbf_features",
     "sample_weights",

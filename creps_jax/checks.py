@@ -24,7 +24,9 @@ from creps_jax.typing import Array, PRNGKey, ScalarLike
 
 __all__ = [
     "FLOAT32_MAX",
+    "FLOAT32_TINY",
     "LARGEST",
+    "NARROWEST",
     "arguments",
     "array",
     "count",
@@ -41,8 +43,12 @@ __all__ = [
 
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """The largest finite number."""
+FLOAT32_TINY = float(np.finfo(np.float32).tiny)
+"""The smallest number above zero that compiled programs do not take for zero."""
 LARGEST = 1e15
 """Size of numbers up to which products of two of them, and sums of those, are finite in float32."""
+NARROWEST = 1e-30
+"""The least width of a range: float32 can hold parts of it too, such as a millionth."""
 _MOST = 2**31 - 1
 """The largest count: indices have 32 bits."""
 _MOST_POINTS = 10_000_000
@@ -160,13 +166,16 @@ def ends(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return both ends of a range as vectors of one length, after checking that the one is below the other.
 
     Raises:
-        ValueError: If it is not, or they are no vectors of one length.
+        ValueError: If it is not, or by less than `NARROWEST`, or they are no vectors of one length.
     """
     low, high = np.atleast_1d(vector("low", low)), np.atleast_1d(vector("high", high))
     if low.shape != high.shape:
         raise ValueError(f"low and high must be vectors of one length, got {low.shape} and {high.shape}")
-    if not np.all(low.astype(np.float32) < high.astype(np.float32)):
+    width = high.astype(np.float32).astype(float) - low.astype(np.float32)
+    if not np.all(width > 0):
         raise ValueError(f"low must be below high, got {low} and {high}")
+    if not np.all(width >= NARROWEST):
+        raise ValueError(f"low must be below high by at least {NARROWEST:g}, got {low} and {high}")
     return low, high
 
 

@@ -12,6 +12,9 @@ from creps_jax.typing import Array, Float, ScalarLike, VectorLike
 
 __all__ = ["penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
 
+_WIDE = 1e37
+"""Width of a box from which it, or its inverse, can be out of the range of float32."""
+
 
 def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) -> Float[Array, "*b d"]:
     """Squash free parameters into a box.
@@ -19,7 +22,8 @@ def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike)
     Args:
         theta: Free parameters, any real numbers.
         low: Lower bounds, in the units of the result.
-        high: Upper bounds; a parameter whose bounds are equal is fixed at them.
+        high: Upper bounds; a parameter whose bounds are equal, or so close that float32 takes their
+            difference for zero, is fixed at them.
 
     Returns:
         Parameters in [low, high]; zero goes to the middle of the box.
@@ -30,8 +34,11 @@ def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike)
     Source: Abdolmaleki et al. 2016, Eq. 17.
     """
     theta, low, high = _box(theta, low, high)
+    # Divided by a power of two, results are the same to the bit.
+    unit = jnp.where(high - low > _WIDE, 16.0, 1.0).astype(theta.dtype)
+    gated = (low / unit + jax.nn.sigmoid(theta) * (high / unit - low / unit)) * unit
     # The clip takes back the last bit that rounding can put outside the box.
-    return jnp.clip(low + jax.nn.sigmoid(theta) * (high - low), low, high)
+    return jnp.clip(gated, low, high)
 
 
 def sigmoid_gate_inverse(
@@ -52,20 +59,27 @@ def sigmoid_gate_inverse(
         ValueError: If bounds do not fit the parameters or each other, or a number is none.
     """
     theta, low, high = _box(theta, low, high)
-    is_free = high > low
-    fraction = jnp.where(is_free, (theta - low) / jnp.where(is_free, high - low, 1.0), 0.5)
+    width = high - low
+    is_wide = width > _WIDE
+    is_free = (width >= float(jnp.finfo(width.dtype).tiny)) & ~is_wide
+    fraction = jnp.where(is_free, (theta - low) / jnp.where(is_free, width, 1.0), 0.5)
+    # Without the width of a wide box, which overflows: compiled programs take its inverse for zero.
+    inside = jnp.clip(theta, low, high)
+    below, above = 0.5 * inside - 0.5 * low, 0.5 * high - 0.5 * inside
+    fraction = jnp.where(is_wide, below / jnp.where(is_wide, below + above, 1.0), fraction)
     margin = float(jnp.finfo(theta.dtype).epsneg)
     return jax.scipy.special.logit(jnp.clip(fraction, margin, 1.0 - margin))
 
 
 def violation(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) -> Float[Array, "*b d"]:
-    """Measure how far each parameter lies outside its bounds: zero inside, positive outside.
+    """Measure how far each parameter lies outside its bounds: zero inside, positive and finite outside.
 
     Raises:
         ValueError: If bounds do not fit the parameters or each other, or a number is none.
     """
     theta, low, high = _box(theta, low, high, largest=math.inf)
-    return jnp.maximum(jnp.maximum(low - theta, theta - high), 0.0)
+    distance = jnp.maximum(jnp.maximum(low - theta, theta - high), 0.0)
+    return jnp.minimum(distance, float(jnp.finfo(theta.dtype).max))
 
 
 def penalty(violation: Float[Array, "*b c"], size: ScalarLike) -> Float[Array, "*b"]:

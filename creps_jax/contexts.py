@@ -1,5 +1,6 @@
 """Draw contexts to learn from, and lay out contexts to evaluate on."""
 
+import dataclasses
 from collections.abc import Callable
 
 import jax
@@ -37,17 +38,14 @@ def gaussian_contexts(
     Source: Abdolmaleki et al. 2016, Section 4; the paper gives no mean and no spread.
     """
     low, high = _checked_range(low, high)
-    scale = (high - low) / 4 if std is None else np.atleast_1d(checks.vector("std", std).astype(np.float32))
-    if scale.shape not in [(1,), low.shape] or not np.all(scale > 0):
+    scale = high / 4 - low / 4 if std is None else np.atleast_1d(checks.vector("std", std).astype(np.float32))
+    if scale.shape not in [(1,), low.shape] or not np.all(scale >= checks.FLOAT32_TINY):
         raise ValueError(f"std must be positive, a number or of shape {low.shape}, got {std}")
-    middle, scale = (low + high) / 2, np.broadcast_to(scale, low.shape)
-
-    @checks.arguments
-    def sample_context(key: PRNGKey) -> Float[Array, " s"]:
-        context = jnp.asarray(middle) + scale * jax.random.normal(key, low.shape)
-        return jnp.clip(context, low, high) if clip else context
-
-    return sample_context
+    scale = np.broadcast_to(scale, low.shape)
+    # Beyond the largest number there is none to draw.
+    largest = np.full_like(low, checks.FLOAT32_MAX)
+    limits = (low, high) if clip else (-largest, largest)
+    return _Gaussian(*map(_numbers, (low / 2 + high / 2, scale, *limits)))
 
 
 def uniform_contexts(low: VectorLike, high: VectorLike) -> Sampler:
@@ -63,13 +61,7 @@ def uniform_contexts(low: VectorLike, high: VectorLike) -> Sampler:
     Raises:
         ValueError: If the ends do not fit each other.
     """
-    low, high = _checked_range(low, high)
-
-    @checks.arguments
-    def sample_context(key: PRNGKey) -> Float[Array, " s"]:
-        return jax.random.uniform(key, low.shape, minval=low, maxval=high)
-
-    return sample_context
+    return _Uniform(*map(_numbers, _checked_range(low, high)))
 
 
 @checks.arguments
@@ -89,8 +81,57 @@ def context_grid(low: VectorLike, high: VectorLike, num: int) -> Float[Array, "n
     """
     low, high = _checked_range(low, high)
     num = checks.grid("num", num, low.size, least=2)
-    axes = [np.linspace(start, stop, num, dtype=np.float32) for start, stop in zip(low, high, strict=True)]
-    return jnp.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes)))
+    half = _halves(low, high)
+    ends = zip(low * half, high * half, strict=True)
+    axes = [np.linspace(start, stop, num, dtype=np.float32) for start, stop in ends]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+    return jnp.asarray(grid / half)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Gaussian:
+    """Draw from a Gaussian, and move what is outside the limits to them."""
+
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @checks.arguments
+    def __call__(self, key: PRNGKey) -> Float[Array, " s"]:
+        mean, std, low, high = map(_vector, (self.mean, self.std, self.low, self.high))
+        return jnp.clip(jnp.asarray(mean) + std * jax.random.normal(key, mean.shape), low, high)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Uniform:
+    """Draw evenly from a range."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @checks.arguments
+    def __call__(self, key: PRNGKey) -> Float[Array, " s"]:
+        low, high = _vector(self.low), _vector(self.high)
+        half = _halves(low, high)
+        return jax.random.uniform(key, low.shape, minval=low * half, maxval=high * half) / half
+
+
+def _halves(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return 0.5 where a range is wider than the largest number, and 1 elsewhere.
+
+    Multiplied with powers of two, results are the same to the bit.
+    """
+    width = high.astype(float) - low
+    return np.where(width > checks.FLOAT32_MAX / 2, np.float32(0.5), np.float32(1.0))
+
+
+def _vector(numbers: tuple[float, ...]) -> np.ndarray:
+    return np.asarray(numbers, np.float32)
+
+
+def _numbers(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(values.tolist())
 
 
 def _checked_range(low: VectorLike, high: VectorLike) -> tuple[np.ndarray, np.ndarray]:

@@ -1,19 +1,42 @@
-"""Make features of the context: linear, quadratic, normalised radial basis functions."""
+"""Make features of the context: linear, quadratic, polynomial, normalised radial basis functions.
 
+What computes them is data, numbers in a record: equal settings give equal features, which can be copied and
+pickled.
+"""
+
+import dataclasses
+import itertools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from creps_jax import checks
 from creps_jax.typing import Array, Float, VectorLike
 
-__all__ = ["FeatureMap", "linear_features", "quadratic_features", "rbf_features", "rbf_grid"]
+__all__ = [
+    "FeatureMap",
+    "linear_features",
+    "polynomial_features",
+    "quadratic_features",
+    "rbf_features",
+    "rbf_grid",
+]
 
 _FAR = 1e20
 """Distance from the range, in bandwidths, beyond which a context counts as that far: no overflow."""
+_LARGE = 1e30
+"""Size of the ends of a range from which differences can overflow, and the inverse of a bandwidth, which
+compiled programs multiply by, can be so small that they take it for zero."""
+_NARROW = 1e-9
+"""Bandwidth, relative to the range, below which squares of distances can overflow. Centres are then a hundred
+bandwidths apart or more, so that only the nearest has a weight."""
+_MOST_FEATURES = 1_000_000
+"""The largest number of monomials: it grows fast, and a slip would fill the memory."""
 
 
 class FeatureMap(NamedTuple):
@@ -42,12 +65,7 @@ def linear_features(dim: int) -> FeatureMap:
 
     Source: Abdolmaleki et al. 2016, text below Eq. 15.
     """
-
-    def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
-        context = _checked_context(context, dim)
-        return jnp.concatenate([jnp.ones_like(context[:1]), context])
-
-    return FeatureMap(apply, 1 + dim, dim)
+    return FeatureMap(_Linear(dim), 1 + dim, dim)
 
 
 @checks.arguments
@@ -68,12 +86,35 @@ def quadratic_features(dim: int) -> FeatureMap:
 
     Source: Abdolmaleki et al. 2016, text below Eq. 11 and 15.
     """
+    return FeatureMap(_Quadratic(dim), 2 * dim, dim)
 
-    def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
-        context = _checked_context(context, dim)
-        return jnp.concatenate([context, context**2])
 
-    return FeatureMap(apply, 2 * dim, dim)
+@checks.arguments
+def polynomial_features(dim: int, degree: int) -> FeatureMap:
+    """Make all monomials of the context variables up to a degree, products of several variables included.
+
+    The constant comes first, then the monomials by their degree; those of one degree in the order of
+    `itertools.combinations_with_replacement`: for s = (x, y) and degree 2 the features are
+    [1, x, y, x^2, x y, y^2].
+
+    Args:
+        dim: Number of context variables.
+        degree: The largest sum of the exponents in a monomial.
+
+    Returns:
+        The map to (dim + degree)! / (dim! degree!) features.
+
+    Raises:
+        ValueError: If `dim` or `degree` is below 1, or there are too many features; on `apply`, if a context
+            has another shape than (dim,).
+    """
+    # The number is not even computed where it has hundreds of digits or more.
+    size = math.inf if min(dim, degree) > 100 else math.comb(dim + degree, degree)
+    if size > _MOST_FEATURES:
+        raise ValueError(
+            f"dim and degree must leave at most {_MOST_FEATURES} features, got {dim} and {degree}"
+        )
+    return FeatureMap(_Polynomial(dim, degree), int(size), dim)
 
 
 def rbf_features(
@@ -100,22 +141,10 @@ def rbf_features(
     Source: Abdolmaleki et al. 2016, Eq. 16. The paper prints the default width for sigma squared, whose unit
     it does not have.
     """
-    lows, highs, _ = _rbf_settings(low, high, num_centers, bandwidth)
-    centers, widths = rbf_grid(low, high, num_centers, bandwidth=bandwidth)
-    dim = lows.size
-
-    def apply(context: Float[Array, " s"]) -> Float[Array, " m"]:
-        context = _checked_context(context, dim)
-        dtype = context.dtype
-        nearest = jnp.clip(context, jnp.asarray(lows, dtype), jnp.asarray(highs, dtype))
-        width = jnp.asarray(widths, dtype)
-        inside = (nearest[None, :] - jnp.asarray(centers, dtype)) / width[None, :]
-        outside = jnp.clip((context - nearest) / width, -_FAR, _FAR)
-        # -(s - c)^2 / 2 sigma^2 less the term all centres share, which far outside would drown the others.
-        log_weights = -jnp.sum(0.5 * inside**2 + outside[None, :] * inside, axis=1)
-        return jax.nn.softmax(log_weights)
-
-    return FeatureMap(apply, centers.shape[0], dim, scale=(1.0,) * centers.shape[0])
+    lows, highs, widths = _rbf_settings(low, high, num_centers, bandwidth)
+    radial = _Radial(tuple(lows.tolist()), tuple(highs.tolist()), int(num_centers), tuple(widths.tolist()))
+    size = radial.num_centers**lows.size
+    return FeatureMap(radial, size, lows.size, scale=(1.0,) * size)
 
 
 def rbf_grid(
@@ -136,9 +165,100 @@ def rbf_grid(
         ValueError: If `rbf_features` would refuse the settings.
     """
     lows, highs, widths = _rbf_settings(low, high, num_centers, bandwidth)
+    return _centers(lows, highs, num_centers), widths
+
+
+@dataclasses.dataclass(frozen=True)
+class _Linear:
+    """Compute the features [1, s]."""
+
+    dim: int
+
+    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
+        context = _checked_context(context, self.dim)
+        return jnp.concatenate([jnp.ones_like(context[:1]), context])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Quadratic:
+    """Compute the features [s, s^2]."""
+
+    dim: int
+
+    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
+        context = _checked_context(context, self.dim)
+        return jnp.concatenate([context, _kept_finite(context**2)])
+
+
+@dataclasses.dataclass(frozen=True)
+class _Polynomial:
+    """Compute all monomials up to a degree."""
+
+    dim: int
+    degree: int
+
+    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
+        context = _checked_context(context, self.dim)
+        monomials = [jnp.ones_like(context[:1])]
+        rows: dict[tuple[int, ...], int] = {(): 0}
+        for degree in range(1, self.degree + 1):
+            # Each is one of the degree below times its last variable.
+            combinations = list(itertools.combinations_with_replacement(range(self.dim), degree))
+            factors = np.array([rows[variables[:-1]] for variables in combinations])
+            last = np.array([variables[-1] for variables in combinations])
+            monomials.append(_kept_finite(monomials[-1][factors] * context[last]))
+            rows = {variables: row for row, variables in enumerate(combinations)}
+        return jnp.concatenate(monomials)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Radial:
+    """Compute normalised radial basis functions."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    num_centers: int
+    width: tuple[float, ...]
+
+    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
+        context = _checked_context(context, len(self.low))
+        low, high, width = (np.asarray(numbers) for numbers in (self.low, self.high, self.width))
+        centers = _centers(low, high, self.num_centers)
+        is_narrow = width < _NARROW * (high - low)
+        width = np.where(is_narrow, high - low, width)
+        # A power of two, so that results are the same to the bit where it is not needed.
+        unit = np.where(np.maximum(np.abs(low), np.abs(high)) > _LARGE, 16.0, 1.0)
+        # Multiplied in another order, as compilers like to, extreme numbers overflow or become zero.
+        is_extreme = np.any(is_narrow | (unit > 1) | (width < 1 / checks.LARGEST) | (width > checks.LARGEST))
+        in_order = lax.optimization_barrier if is_extreme else lambda numbers: numbers
+        low, high, width, centers, unit = (
+            jnp.asarray(numbers, context.dtype)
+            for numbers in (low / unit, high / unit, width / unit, centers / unit, unit)
+        )
+        context = in_order(context / unit)
+        nearest = jnp.clip(context, low, high)
+        inside = in_order((nearest[None, :] - centers) / width[None, :])
+        outside = in_order(jnp.clip((context - nearest) / width, -_FAR, _FAR))
+        # (s - c)^2 / 2 sigma^2 less the term all centres share, which far outside would drown the others.
+        costs = 0.5 * inside**2 + outside[None, :] * inside
+        if is_narrow.any():
+            distance = jnp.abs(inside)
+            is_nearest = distance == jnp.min(distance, axis=0)[None, :]
+            costs = jnp.where(is_narrow[None, :], jnp.where(is_nearest, 0.0, jnp.inf), costs)
+        return jax.nn.softmax(-jnp.sum(costs, axis=1))
+
+
+def _centers(low: np.ndarray, high: np.ndarray, num_centers: int) -> np.ndarray:
+    """Return a row for each centre, in the order of the features."""
     places = np.linspace(0.0, 1.0, num_centers) if num_centers > 1 else np.array([0.5])
-    grid = np.stack(np.meshgrid(*[places] * lows.size, indexing="ij"), axis=-1).reshape(-1, lows.size)
-    return lows + grid * (highs - lows), widths
+    grid = np.stack(np.meshgrid(*[places] * low.size, indexing="ij"), axis=-1).reshape(-1, low.size)
+    return low + grid * (high - low)
+
+
+def _kept_finite(features: Array) -> Array:
+    """Take what has overflowed for the largest number: its product with zero is then a number too."""
+    largest = float(jnp.finfo(features.dtype).max)
+    return jnp.clip(features, -largest, largest)
 
 
 def _rbf_settings(
@@ -150,8 +270,9 @@ def _rbf_settings(
     widths = (highs - lows) / num_centers if bandwidth is None else checks.vector("bandwidth", bandwidth)
     if widths.shape not in ((), (1,), lows.shape):
         raise ValueError(f"bandwidth must be a number or as long as low, {lows.size}, got {bandwidth}")
-    if not np.all(widths.astype(np.float32) > 0):
-        raise ValueError(f"bandwidth must be above zero, got {bandwidth}")
+    if not np.all(widths >= checks.FLOAT32_TINY):
+        note = ", which float32 cannot hold" if np.all(widths > 0) else ""
+        raise ValueError(f"bandwidth must be above zero, got {bandwidth}{note}")
     return lows, highs, np.broadcast_to(widths, lows.shape)
 
 

@@ -659,6 +659,7 @@ ROWS = {
         high=vector((1.0, 1.0), bears=(math.inf,)),
         penalty=number(10.0, least=0.0),
     ),
+    "polynomial_features": row(cj.polynomial_features, use=use_features, dim=count(2), degree=count(3)),
     "quadratic_features": row(cj.quadratic_features, use=use_features, dim=count(2)),
     "rbf_features": row(
         cj.rbf_features,

@@ -66,3 +66,104 @@ def test_penalty_is_charged_once_and_only_outside():
 def test_refuses_bounds_that_do_not_fit(function):
     with pytest.raises(ValueError, match=r"got shapes \(3,\), \(2,\) and \(\)"):
         function(jnp.zeros(3), (0.0, 0.0), 1.0)
+
+
+LARGEST = float(np.finfo(np.float32).max)
+# A box of all kinds of bounds at once, and each of them alone.
+BOXES = {
+    "wide": (-3e38, 3e38),
+    "widest": (-LARGEST, LARGEST),
+    "half wide": (0.0, LARGEST),
+    "quarter wide": (-4e37, 4e37),
+    "high": (3e38, 3.1e38),
+    "narrow": (0.0, 1e-30),
+    "denormal": (2e-38, 2.5e-38),
+    "denormal bounds": (0.0, 1e-39),
+    "fixed": (3e38, 3e38),
+    "all at once": ((-3e38, 0.0, 2e-38, -1.0, 3e38), (3e38, 1e-30, 2.5e-38, 1.0, 3e38)),
+}
+boxes = pytest.mark.parametrize(("low", "high"), BOXES.values(), ids=BOXES)
+# How the bounds come: as numbers, as constants of a program, as its arguments.
+CALLS = {
+    "eager": lambda function, theta, low, high: function(jnp.asarray(theta), low, high),
+    "constants": lambda function, theta, low, high: jax.jit(lambda theta: function(theta, low, high))(theta),
+    "arguments": lambda function, theta, low, high: jax.jit(function)(
+        theta, jnp.float32(low), jnp.float32(high)
+    ),
+}
+calls = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+
+
+def of_size(values, low):
+    return np.float32(values)[:, None] * np.ones((1, np.size(low)), np.float32)
+
+
+@boxes
+@calls
+def test_gate_of_an_extreme_box_stays_inside(low, high, call):
+    theta = of_size([-LARGEST, -1e4, -20, -1, 0, 1, 20, 1e4, LARGEST], low)
+    with jax.debug_nans(True):
+        gated = np.asarray(call(sigmoid_gate, theta, low, high))
+    ends = np.float64(np.float32(low)), np.float64(np.float32(high))
+    assert np.isfinite(gated).all() and (gated >= np.float32(low)).all() and (gated <= np.float32(high)).all()
+    width = ends[1] - ends[0]
+    with np.errstate(over="ignore"):
+        expected = ends[0] + width / (1 + np.exp(-np.float64(theta)))
+    # What is below the smallest ordinary number counts as zero.
+    size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    assert (np.abs(gated - expected) <= 1e-6 * size + 1.2e-38).all()
+
+
+@boxes
+@calls
+def test_inverse_of_an_extreme_box_is_finite_and_undoes_the_gate(low, high, call):
+    ends = np.float64(np.float32(low)), np.float64(np.float32(high))
+    inside = np.float32(ends[0] + np.linspace(0, 1, 9)[:, None] * (ends[1] - ends[0]))
+    theta = np.concatenate([inside.reshape(9, -1), of_size([-LARGEST, 0, LARGEST], low)])
+    with jax.debug_nans(True):
+        free = call(sigmoid_gate_inverse, theta, low, high)
+    assert np.isfinite(free).all() and (np.abs(free) < 20).all()
+    width = ends[1] - ends[0]
+    back = np.float64(sigmoid_gate(free[:9], low, high))
+    size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    assert (np.abs(back - inside) <= 1e-6 * np.maximum(width, size) + 1.2e-38).all()
+
+
+@boxes
+@calls
+def test_violation_of_an_extreme_box_is_finite(low, high, call):
+    theta = of_size([-LARGEST, -1e20, 0, 1e20, LARGEST], low)
+    with jax.debug_nans(True):
+        distance = np.float64(call(violation, theta, low, high))
+    ends = np.float64(np.float32(low)), np.float64(np.float32(high))
+    expected = np.maximum(np.maximum(ends[0] - theta, theta - ends[1]), 0)
+    np.testing.assert_allclose(distance, np.minimum(expected, LARGEST), rtol=1e-6, atol=1.2e-38)
+
+
+@pytest.mark.parametrize("call", [CALLS["eager"], CALLS["constants"]], ids=["eager", "constants"])
+def test_ordinary_boxes_give_the_plain_formulas_to_the_bit(call):
+    random = np.random.default_rng(0)
+    low = np.float32(random.normal(size=8) * 10.0 ** np.arange(-6, 2))
+    high = np.float32(low + np.abs(random.normal(size=8)) * 10.0 ** random.integers(-3, 3, 8))
+
+    def plain_gate(theta, low, high):
+        low, high = (jnp.broadcast_to(jnp.asarray(end), theta.shape) for end in (low, high))
+        return jnp.clip(low + jax.nn.sigmoid(theta) * (high - low), low, high)
+
+    def plain_inverse(theta, low, high):
+        low, high = (jnp.broadcast_to(jnp.asarray(end), theta.shape) for end in (low, high))
+        margin = float(jnp.finfo(jnp.float32).epsneg)
+        return jax.scipy.special.logit(jnp.clip((theta - low) / (high - low), margin, 1.0 - margin))
+
+    def plain_violation(theta, low, high):
+        low, high = (jnp.broadcast_to(jnp.asarray(end), theta.shape) for end in (low, high))
+        return jnp.maximum(jnp.maximum(low - theta, theta - high), 0.0)
+
+    free = jnp.float32(random.normal(size=(200, 8)) * 10.0 ** random.uniform(-2, 1.5, (200, 1)))
+    inside = jnp.float32(low + (high - low) * random.uniform(-0.2, 1.2, (200, 8)))
+    for function, plain, theta in (
+        (sigmoid_gate, plain_gate, free),
+        (sigmoid_gate_inverse, plain_inverse, inside),
+        (violation, plain_violation, inside),
+    ):
+        np.testing.assert_array_equal(call(function, theta, low, high), call(plain, theta, low, high))

@@ -87,6 +87,19 @@ def test_wrappers_stack(task, key):
     np.testing.assert_allclose(outcome.violation, [4.0, 4.0])
 
 
+@pytest.mark.parametrize(("low", "high"), [(-3e38, 3e38), ((0.0, -3e38), (1e-30, -2.9e38)), (3e38, 3.1e38)])
+@pytest.mark.parametrize("compiled", [False, True])
+def test_wrappers_of_extreme_bounds_stay_finite_and_inside(task, key, low, high, compiled):
+    largest = float(np.finfo(np.float32).max)
+    for wrapped in (sigmoid_constrained(task, low, high), penalised(task, low, high, 10.0)):
+        rollout = jax.jit(wrapped.rollout) if compiled else wrapped.rollout
+        for size in (-largest, -1.0, 0.0, 30.0, largest):
+            with jax.debug_nans(True):
+                outcome = rollout(key, CONTEXT, jnp.float32(size) * jnp.ones(2))
+            assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(outcome))
+            assert (outcome.theta >= np.float32(low)).all() and (outcome.theta <= np.float32(high)).all()
+
+
 @pytest.mark.parametrize(
     ("wrap", "message"),
     [
