@@ -24,6 +24,8 @@ _RESOLUTION = 5e-6
 _LEAST_SPREAD = 3e-4
 """Directions of the standardised features with less spread are left out: in V they would be differences of
 large numbers."""
+_SPARE_EXPONENTS = 8
+"""How far, in powers of two, coefficients may be from what their units suggest."""
 _NEARLY_GREEDY = 0.99
 """Share of the largest possible relative entropy that the weights get where the bound is out of reach."""
 
@@ -118,21 +120,15 @@ def solve_dual(
     """
     reward, features, prior = _checked_samples(reward, features, valid)
     kl_bound = jnp.asarray(checks.number("kl_bound", kl_bound, above=0.0), reward.dtype)
-    samples, unit = _standardise(reward, features, prior)
-
-    guess = _search(samples, kl_bound)
-    solution = DualSolution(
-        temperature=jnp.maximum(unit * guess.temperature, jnp.finfo(unit.dtype).tiny),
-        baseline_coef=unit * guess.baseline_coef,
-        grad_norm=jnp.zeros_like(unit),
-        num_steps=guess.num_steps,
-        is_active=guess.is_active,
-    )
+    samples = _rescaled(reward, features, prior)
+    standardised, unit = _standardise(samples)
+    guess = _search(standardised, kl_bound)
+    solution = _solution(guess, unit, samples)
     # The quality is that of the weights as the caller gets them, with the rounding of the solution.
-    weights = sample_weights(solution, reward, features, valid)
+    weights = _weights(solution, samples)
     excess = sample_kl(weights, samples.prior * jnp.any(weights > 0).astype(weights.dtype)) - kl_bound
-    excess = jnp.where(guess.is_active, excess, jnp.maximum(excess, 0.0))
-    mismatch = exact_dot(weights - samples.prior, samples.whitened)
+    excess = jnp.where(solution.is_active, excess, jnp.maximum(excess, 0.0))
+    mismatch = exact_dot(weights - samples.prior, standardised.whitened)
     return solution._replace(grad_norm=jnp.sqrt(excess**2 + jnp.sum(mismatch**2)))
 
 
@@ -161,11 +157,7 @@ def sample_weights(
     """
     reward, features, prior = _checked_samples(reward, features, valid)
     solution = _checked_solution(solution, features)
-    is_counted = _is_counted(reward, features, prior)
-    reward, features, prior = _mask(reward, features, prior)
-    shifted, centred = _shift(reward, prior), centre_columns(features, prior)
-    advantage = (shifted - exact_dot(centred, solution.baseline_coef)) / solution.temperature
-    return jnp.where(is_counted, _softmax(advantage, prior), 0.0)
+    return _weights(solution, _rescaled(reward, features, prior))
 
 
 def sample_kl(weights: Float[Array, " n"], valid: Valid | None = None) -> Scalar:
@@ -191,14 +183,47 @@ def sample_kl(weights: Float[Array, " n"], valid: Valid | None = None) -> Scalar
     return jnp.sum(weights * log_ratio - prior * change, where=prior > 0)
 
 
+def _weights(solution: DualSolution, samples: "_Samples") -> Array:
+    coef = jnp.ldexp(solution.baseline_coef, samples.feature_exponents - samples.reward_exponent)
+    temperature = jnp.ldexp(solution.temperature, -samples.reward_exponent)
+    temperature = jnp.maximum(temperature, jnp.finfo(temperature.dtype).tiny)
+    advantage = (samples.reward - exact_dot(samples.features, coef)) / temperature
+    return jnp.where(samples.is_counted, _softmax(advantage, samples.prior), 0.0)
+
+
+def _solution(guess: "_Guess", unit: Array, samples: "_Samples") -> DualSolution:
+    """Return a point of the search in the units of the user, as far as the format can hold it."""
+    info = jnp.finfo(unit.dtype)
+    temperature = jnp.ldexp(unit * guess.temperature, samples.reward_exponent)
+    coef = jnp.ldexp(unit * guess.baseline_coef, samples.reward_exponent - samples.feature_exponents)
+    return DualSolution(
+        temperature=jnp.clip(temperature, info.tiny, info.max),
+        baseline_coef=jnp.clip(coef, info.min, info.max),
+        grad_norm=jnp.zeros_like(unit),
+        num_steps=guess.num_steps,
+        is_active=guess.is_active & jnp.isfinite(temperature) & jnp.all(jnp.isfinite(coef)),
+    )
+
+
 class _Samples(NamedTuple):
-    """Standardised samples; all rows that do not count are zero."""
+    """Samples in units that neither overflow nor underflow; all rows that do not count are zero."""
+
+    reward: Array  # less the largest: from -1 to 0
+    features: Array  # less their mean
+    prior: Array  # sums to one; zero where a sample does not count
+    is_counted: Array
+    reward_exponent: Array  # the unit of the rewards is two to this power
+    feature_exponents: Array  # and that of each feature
+
+
+class _Standardised(NamedTuple):
+    """What the search works with."""
 
     reward: Array  # from -1 to 0
     centred: Array  # features less their mean
     whitening: Array
     whitened: Array  # centred @ whitening: uncorrelated features of mean square one
-    prior: Array  # sums to one; zero where a sample does not count
+    prior: Array
 
 
 class _Guess(NamedTuple):
@@ -213,7 +238,7 @@ class _Guess(NamedTuple):
     num_steps: Array
 
 
-def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
+def _first_guess(samples: _Standardised, kl_bound: Array) -> _Guess:
     """Return the solution for a small bound: a least-squares baseline, and the spread that it leaves."""
     coef = exact_dot(samples.whitening, exact_dot(samples.prior * samples.reward, samples.whitened))
     residual = samples.reward - exact_dot(samples.centred, coef)
@@ -233,7 +258,7 @@ def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
     )
 
 
-def _search(samples: _Samples, kl_bound: Array) -> _Guess:
+def _search(samples: _Standardised, kl_bound: Array) -> _Guess:
     """Improve a first guess, round by round; midway, give up a bound that is out of reach.
 
     One round is enough for well-behaved rewards. Where some are far worse than the others (falls), the scale
@@ -267,7 +292,7 @@ def _misses(guess: _Guess, kl_bound: Array) -> Array:
     return (guess.temperature <= 1.1 * guess.floor) | (guess.kl < 0.999 * kl_bound)
 
 
-def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
+def _improve(guess: _Guess, samples: _Standardised, kl_bound: Array) -> _Guess:
     """Standardise the rewards by the last guess, and minimise the dual function of what is left."""
     floor = _temperature_floor(guess, samples)
     unit = jnp.maximum(guess.temperature, 2.0 * floor)
@@ -299,7 +324,7 @@ def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
     return improved._replace(is_settled=is_settled)
 
 
-def _temperature_floor(guess: _Guess, samples: _Samples) -> Array:
+def _temperature_floor(guess: _Guess, samples: _Standardised) -> Array:
     """Return the temperature below which rounding of the advantages would decide between samples."""
     # An advantage is a difference of these numbers and carries their rounding.
     size = jnp.abs(samples.reward) + exact_dot(jnp.abs(samples.centred), jnp.abs(guess.baseline_coef))
@@ -308,24 +333,42 @@ def _temperature_floor(guess: _Guess, samples: _Samples) -> Array:
     return jnp.where(mean_size > 0, lowered, guess.floor)
 
 
-def _weigh(guess: _Guess, samples: _Samples) -> Array:
+def _weigh(guess: _Guess, samples: _Standardised) -> Array:
     return _softmax(_advantage(samples, guess.temperature, guess.baseline_coef), samples.prior)
 
 
-def _standardise(reward: Array, features: Array, prior: Array) -> tuple[_Samples, Array]:
-    """Return standardised samples, and the unit of their rewards."""
+def _rescaled(reward: Array, features: Array, prior: Array) -> _Samples:
+    """Shift rewards and centre features, in units that bear every number of the format."""
+    is_counted = _is_counted(reward, features, prior)
     reward, features, prior = _mask(reward, features, prior)
-    shifted = _shift(reward, prior)
-    spread = jnp.max(jnp.abs(shifted))
-    # Equal rewards have no spread: their unit is then that of their rounding.
-    rounding = jnp.finfo(reward.dtype).eps * jnp.max(jnp.abs(reward))
-    unit = jnp.where(spread > 0, spread, jnp.where(rounding > 0, rounding, 1.0))
-    centred = centre_columns(features, prior)
-    matrix = whitening(centred, prior, least_spread=_LEAST_SPREAD)
-    return _Samples(shifted / unit, centred, matrix, exact_dot(centred, matrix), prior), unit
+    # Powers of two round nothing. Half the size of the rewards, as a difference may be twice as large.
+    reward_exponent = jnp.frexp(jnp.max(jnp.abs(reward)))[1] + 1
+    feature_exponents = jnp.frexp(jnp.max(jnp.abs(features), axis=0))[1]
+    return _Samples(
+        reward=_shift(jnp.ldexp(reward, -reward_exponent), prior),
+        features=centre_columns(jnp.ldexp(features, -feature_exponents[None, :]), prior),
+        prior=prior,
+        is_counted=is_counted,
+        reward_exponent=reward_exponent,
+        feature_exponents=feature_exponents,
+    )
 
 
-def _advantage(samples: _Samples, temperature: Array, baseline_coef: Array) -> Array:
+def _standardise(samples: _Samples) -> tuple[_Standardised, Array]:
+    """Return standardised samples, and the unit of their rewards."""
+    spread = jnp.max(jnp.abs(samples.reward))
+    unit = jnp.where(spread > 0, spread, 1.0)
+    # Features whose coefficients the format cannot hold are left out.
+    exponents = samples.feature_exponents + jnp.frexp(jnp.max(jnp.abs(samples.features), axis=0))[1]
+    exponents = samples.reward_exponent + jnp.frexp(unit)[1] - exponents
+    is_usable = jnp.abs(exponents) < jnp.finfo(unit.dtype).maxexp - _SPARE_EXPONENTS
+    centred = jnp.where(is_usable[None, :], samples.features, 0.0)
+    matrix = whitening(centred, samples.prior, least_spread=_LEAST_SPREAD)
+    whitened = exact_dot(centred, matrix)
+    return _Standardised(samples.reward / unit, centred, matrix, whitened, samples.prior), unit
+
+
+def _advantage(samples: _Standardised, temperature: Array, baseline_coef: Array) -> Array:
     return (samples.reward - exact_dot(samples.centred, baseline_coef)) / temperature
 
 
@@ -362,16 +405,31 @@ def _mask(reward: Array, features: Array, prior: Array) -> tuple[Array, Array, A
 
 
 def _normalised(weights: Array) -> Array:
-    """Scale weights, if there are any, to a sum of one; those that are too small for the format get zero."""
-    # By the largest first: a sum of large ones overflows.
-    largest = jnp.max(weights)
-    weights = weights / jnp.where(largest > 0, largest, 1.0)
-    weights = weights / jnp.maximum(jnp.sum(weights), 1.0)
-    return jnp.where(weights >= jnp.finfo(weights.dtype).tiny, weights, 0.0)
+    """Scale weights of any size, if there are any, to a sum of one; relatively tiny ones become zero."""
+    info, bits = jnp.finfo(weights.dtype), _bits(weights)
+    # Compiled code reads denormal numbers as zero, and divides by multiplying with a reciprocal, which is one
+    # for large divisors. As an integer a denormal number is itself in units of the smallest one.
+    is_denormal = (bits > 0) & (bits < 1 << info.nmant)
+    readable = jnp.where(is_denormal, bits.astype(weights.dtype), weights)
+    exponent = jnp.where(is_denormal, info.minexp - info.nmant, 0)
+    largest = jnp.max(jnp.where(bits > 0, jnp.frexp(readable)[1] + exponent, -(2**30)))
+    weights = jnp.where(bits > 0, jnp.ldexp(readable, exponent - largest), 0.0)  # the largest is about one
+    weights = weights / jnp.maximum(jnp.sum(weights), 0.5)
+    return jnp.where(weights >= info.tiny, weights, 0.0)
+
+
+def _bits(values: Array) -> Array:
+    """Return numbers as integers of the same bits: above zero where and only where the number is."""
+    return lax.bitcast_convert_type(values, jnp.dtype(f"int{jnp.finfo(values.dtype).bits}"))
 
 
 def _is_counted(reward: Array, features: Array, prior: Array) -> Array:
-    return (prior > 0) & jnp.isfinite(prior) & jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
+    return (
+        (_bits(prior) > 0)
+        & jnp.isfinite(prior)
+        & jnp.isfinite(reward)
+        & jnp.all(jnp.isfinite(features), axis=1)
+    )
 
 
 def _checked_samples(reward: Array, features: Array, valid: Array | None) -> tuple[Array, Array, Array]:

@@ -425,14 +425,6 @@ def test_a_small_prior_with_a_large_reward_breaks_nothing(key, small, gap):
     assert jnp.isfinite(hessian).all()
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1e37])
-def test_the_scale_of_a_prior_does_not_matter(key, scale):
-    reward, features = jax.random.normal(key, (NUM,)), jnp.linspace(-1.0, 1.0, NUM)[:, None]
-    expected = solve_dual(reward, features, kl_bound=0.5)
-    found = solve_dual(reward, features, jnp.full(NUM, scale), kl_bound=0.5)
-    np.testing.assert_allclose(found.temperature, expected.temperature, rtol=1e-4)
-
-
 @pytest.mark.usefixtures("compiled_as_for_users")
 def test_vmap_equals_loop():
     batches = [samples(seed) for seed in range(4)]
@@ -447,3 +439,78 @@ def test_vmap_equals_loop():
         rounding = 1e-3 if i < 3 else 0.1  # of the relative entropy of greedy weights, which sets the last
         np.testing.assert_allclose(solutions.temperature[i], alone.temperature, rtol=rounding)
         np.testing.assert_allclose(weights[i], alone_weights, atol=rounding / 10)
+
+
+# Numbers of any size.
+
+
+def solve_eagerly_and_compiled(reward, features, valid):
+    """Return both answers, after checking that they are finite and say the same."""
+    reward, features, valid = (jnp.asarray(x, jnp.float32) for x in (reward, features, valid))
+    solution = solve_dual(reward, features, valid, kl_bound=0.5)
+    eager = solution, sample_weights(solution, reward, features, valid)
+    compiled = solve(reward, features, valid, jnp.float32(0.5))
+    for solution, weights in (eager, compiled):
+        assert_finite(solution, weights)
+        assert float(solution.temperature) > 0
+        np.testing.assert_allclose(np.sum(np.asarray(weights, np.float64)), 1.0, atol=1e-5)
+        assert float(sample_kl(weights, valid)) < 0.5 * (1 + 1e-3)
+    np.testing.assert_allclose(eager[0].temperature, compiled[0].temperature, rtol=1e-4)
+    np.testing.assert_allclose(eager[1], compiled[1], rtol=1e-3, atol=1e-7)
+    return compiled
+
+
+@pytest.mark.usefixtures("compiled_as_for_users")
+@pytest.mark.parametrize("scale", [3.4e38, 9e37, 1e37, 1e-30, 1e-37, 1e-38, 1e-40, 1e-43, 1.4e-45])
+@pytest.mark.parametrize("is_uniform", [True, False])
+def test_only_the_ratios_of_a_prior_matter(scale, is_uniform):
+    _, features, reward = samples()
+    ratio = np.ones(NUM) if is_uniform else np.random.default_rng(7).choice([1.0, 0.5, 0.0], size=NUM)
+    # What the format makes of small ones.
+    prior = np.float32(ratio) * np.float32(scale)
+    assert prior.any()
+    solution, weights = solve_eagerly_and_compiled(reward, features, prior)
+    expected, expected_weights = solve_eagerly_and_compiled(
+        reward, features, np.float64(prior) / np.float64(prior.max())
+    )
+    np.testing.assert_allclose(solution.temperature, expected.temperature, rtol=1e-4)
+    np.testing.assert_allclose(weights, expected_weights, rtol=1e-3, atol=1e-7)
+    assert np.all((np.asarray(weights) > 0) == (prior > 0))
+
+
+HUGE = {
+    "both ends": lambda reward: np.where(np.arange(NUM) % 2, 3e38, -3e38),
+    "all large": lambda reward: 1e37 * reward,
+    "all at the end": lambda reward: np.full(NUM, 3.4e38),
+    "one up": lambda reward: np.where(np.arange(NUM) == 3, 1e38, reward),
+    "one down": lambda reward: np.where(np.arange(NUM) == 3, -3.4e38, reward),
+    "one each way": lambda reward: np.where(np.arange(NUM) < 2, [3.4e38, -3.4e38] * (NUM // 2), reward),
+    "all magnitudes": lambda reward: np.sign(reward + 1) * 10.0 ** np.linspace(-38, 38, NUM),
+    "ordinary": lambda reward: reward,
+    "tiny": lambda reward: 1e-30 * reward,
+}
+UNITS = {
+    "one": np.ones(NUM_FEATURES),
+    "large": np.full(NUM_FEATURES, 1e30),
+    "tiny": np.full(NUM_FEATURES, 1e-30),
+    "at the ends": np.array([3e38, 1e-37, 1.0, 1e38, 1e-38]),
+    "mixed": np.array([1e30, 1e-30, 1.0, 1e15, 1e-15]),
+}
+
+
+@pytest.mark.usefixtures("compiled_as_for_users")
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("name", HUGE)
+def test_what_is_finite_has_a_finite_answer(name, unit):
+    _, features, reward = samples()
+    solve_eagerly_and_compiled(HUGE[name](reward), features * UNITS[unit], np.ones(NUM))
+
+
+@pytest.mark.parametrize("exponent", [-90, 90])
+def test_units_of_features_change_no_weight(exponent):
+    _, features, reward = samples()
+    features, units = np.float32(features), 2.0 ** (exponent * np.array([1, -1, 0, 1, 0]))
+    solution, weights = solve_all(reward, features * units)
+    expected, expected_weights = solve_all(reward, features)
+    np.testing.assert_array_equal(weights, expected_weights)
+    np.testing.assert_array_equal(solution.baseline_coef * np.float32(units), expected.baseline_coef)
