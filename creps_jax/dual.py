@@ -1,29 +1,37 @@
 """Weigh samples by contextual relative entropy policy search: the dual function, its minimum, the weights."""
 
-from typing import NamedTuple, TypeAlias
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.special import logsumexp
 
 from creps_jax import checks
-from creps_jax.linalg import centre_columns, exact_dot, whitening
+from creps_jax.linalg import centre_columns, exact_dot, weighted_ridge, whitening
 from creps_jax.minimise import minimise
-from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
+from creps_jax.typing import Array, Bool, Float, Int, Num, Scalar, ScalarLike
 
 __all__ = ["DualSolution", "dual_objective", "sample_kl", "sample_weights", "solve_dual"]
 
-Valid: TypeAlias = Bool[Array, " n"] | Float[Array, " n"]
+Rewards: TypeAlias = Float[Array, " n"] | Num[np.ndarray, " n"] | Sequence[float | int]
+"""Rewards; what is of float64 outside of jax loses no digits of their differences."""
+Features: TypeAlias = Float[Array, "n m"] | Float[np.ndarray, "n m"]
+Valid: TypeAlias = Bool[Array, " n"] | Float[Array, " n"] | Bool[np.ndarray, " n"] | Float[np.ndarray, " n"]
 """Which samples count, or as numbers: how much each counts."""
 
 _NUM_ROUNDS = 4
 """Most rounds of standardising and minimising, before and after the bound may be given up."""
-_RESOLUTION = 5e-6
-"""Lowest temperature, as a share of the numbers whose difference is the advantage: what float32 can order."""
-_LEAST_SPREAD = 3e-4
-"""Directions of the standardised features with less spread are left out: in V they would be differences of
-large numbers."""
+_RESOLUTION = 42.0
+"""Lowest temperature, in units of the rounding of the numbers whose difference is the advantage."""
+_ROUNDING = 1.75
+"""Size of differences, in the same unit, up to which they are rounding."""
+_FIT_ROUNDING = 4.0
+"""The same of a baseline, in units of the rounding of its terms."""
+_SPARE_EXPONENTS = 8
+"""How far, in powers of two, coefficients may be from what their units suggest."""
 _NEARLY_GREEDY = 0.99
 """Share of the largest possible relative entropy that the weights get where the bound is out of reach."""
 
@@ -41,8 +49,11 @@ class DualSolution(NamedTuple):
     num_steps: Int[Array, ""]
     """Newton steps taken."""
     is_active: Bool[Array, ""]
-    """Whether the relative entropy equals its bound. False where no temperature reaches it, with equal
-    rewards or too few samples: the weights are then nearly greedy."""
+    """Whether the relative entropy equals its bound. False where no temperature reaches it, as with too few
+    samples: the weights are then nearly greedy. False as well where the weights are what `valid` gives."""
+    is_informative: Bool[Array, ""] | bool = True
+    """Whether the samples call for other weights than `valid` gives them. False where all that the baseline
+    leaves of the rewards is rounding, or where a traced bound is no number above zero."""
 
 
 def dual_objective(
@@ -68,8 +79,9 @@ def dual_objective(
 
     Source: Abdolmaleki et al. 2016, Eq. 13.
     """
-    reward, features, prior = _checked_samples(reward, features, valid)
-    return _dual(log_temperature, baseline_coef, *_mask(reward, features, prior), kl_bound)
+    reward, features, prior = _mask(*_checked_samples(reward, features, valid))
+    coef, bound = (jnp.asarray(x, reward.dtype) for x in (baseline_coef, kl_bound))
+    return _dual(jnp.asarray(log_temperature, reward.dtype), coef, reward, features, prior, bound)
 
 
 def _dual(
@@ -89,11 +101,12 @@ def _dual(
 
 
 def solve_dual(
-    reward: Float[Array, " n"],
-    features: Float[Array, "n m"],
+    reward: Rewards,
+    features: Features,
     valid: Valid | None = None,
     *,
     kl_bound: ScalarLike,
+    resolution: ScalarLike | None = None,
 ) -> DualSolution:
     """Minimise the dual function over the temperature and the baseline.
 
@@ -106,6 +119,8 @@ def solve_dual(
         valid: Which samples count; all by default. As numbers: how much each counts before its reward is
             seen, such as its importance weight. One whose reward or features are not finite never counts.
         kl_bound: Largest relative entropy epsilon between the weights and those of `valid`, above zero.
+        resolution: Size of the differences between rewards that are rounding; by default that of the largest
+            reward in the format that it was given in. For rewards less an offset it is that of the offset.
 
     Returns:
         The solution, finite for any number of samples that count, none included. Where the bound is active,
@@ -116,30 +131,45 @@ def solve_dual(
 
     Source: Abdolmaleki et al. 2016, Eq. 12 and 13.
     """
-    reward, features, prior = _checked_samples(reward, features, valid)
-    kl_bound = jnp.asarray(checks.number("kl_bound", kl_bound, above=0.0), reward.dtype)
-    samples, unit = _standardise(reward, features, prior)
+    if resolution is not None:
+        checks.number("resolution", resolution, least=0.0)
+    given, rounding = _without_offset(reward, valid)
+    given, features, prior = _checked_samples(given, features, valid)
+    relative = _ROUNDING * _eps(given, reward) if resolution is None and rounding is None else 0.0
+    absolute = resolution if resolution is not None else 0.0 if rounding is None else rounding
+    numbers = checks.number("kl_bound", kl_bound, above=0.0), relative, absolute
+    return _solve(given, features, prior, *(jnp.asarray(number, given.dtype) for number in numbers))
 
-    guess = _search(samples, kl_bound)
-    solution = DualSolution(
-        temperature=jnp.maximum(unit * guess.temperature, jnp.finfo(unit.dtype).tiny),
-        baseline_coef=unit * guess.baseline_coef,
-        grad_norm=jnp.zeros_like(unit),
-        num_steps=guess.num_steps,
-        is_active=guess.is_active,
-    )
+
+# Compiled here, as it is called by hand as well.
+@jax.jit
+def _solve(
+    reward: Array, features: Array, prior: Array, kl_bound: Array, relative: Array, absolute: Array
+) -> DualSolution:
+    """Solve for samples of one format; differences are rounding by their size relative to the rewards'."""
+    samples = _rescaled(reward, features, prior)
+    threshold = relative * samples.largest + jnp.ldexp(absolute, -samples.reward_exponent)
+    is_bound = kl_bound > 0  # a traced one may be no such number
+    # No weights have more than all on the sample with the least prior. A bound far beyond that would drive
+    # the temperature down to where rounding decides; one nat beyond, it still does not count as met.
+    kl_bound = jnp.minimum(jnp.where(is_bound, kl_bound, 1.0), 1.0 - jnp.min(_log(samples.prior)))
+    standardised, unit = _standardise(samples)
+    first = _first_guess(standardised, kl_bound)
+    is_informative = is_bound & _is_informative(first, standardised, threshold / unit)
+    guess = _search(first._replace(is_settled=~is_informative), standardised, kl_bound)
+    solution = _solution(guess, unit, samples, is_informative)
     # The quality is that of the weights as the caller gets them, with the rounding of the solution.
-    weights = sample_weights(solution, reward, features, valid)
+    weights = _weights(solution, samples)
     excess = sample_kl(weights, samples.prior * jnp.any(weights > 0).astype(weights.dtype)) - kl_bound
-    excess = jnp.where(guess.is_active, excess, jnp.maximum(excess, 0.0))
-    mismatch = exact_dot(weights - samples.prior, samples.whitened)
+    excess = jnp.where(solution.is_active, excess, jnp.maximum(excess, 0.0))
+    mismatch = exact_dot(weights - samples.prior, standardised.whitened)
     return solution._replace(grad_norm=jnp.sqrt(excess**2 + jnp.sum(mismatch**2)))
 
 
 def sample_weights(
     solution: DualSolution,
-    reward: Float[Array, " n"],
-    features: Float[Array, "n m"],
+    reward: Rewards,
+    features: Features,
     valid: Valid | None = None,
 ) -> Float[Array, " n"]:
     """Weigh the samples by exp((R - V(s)) / eta), times how much they count before.
@@ -152,20 +182,17 @@ def sample_weights(
             seen, such as its importance weight. One whose reward or features are not finite never counts.
 
     Returns:
-        Weights that sum to one, zero where a sample does not count; all zero if none does.
+        Weights that sum to one, zero where a sample does not count; all zero if none does. They are what
+        `valid` gives where the solution is not informative.
 
     Raises:
         ValueError: If shapes do not fit.
 
     Source: Abdolmaleki et al. 2016, the solution p(s, theta) below Eq. 12.
     """
-    reward, features, prior = _checked_samples(reward, features, valid)
+    reward, features, prior = _checked_samples(_without_offset(reward, valid)[0], features, valid)
     solution = _checked_solution(solution, features)
-    is_counted = _is_counted(reward, features, prior)
-    reward, features, prior = _mask(reward, features, prior)
-    shifted, centred = _shift(reward, prior), centre_columns(features, prior)
-    advantage = (shifted - exact_dot(centred, solution.baseline_coef)) / solution.temperature
-    return jnp.where(is_counted, _softmax(advantage, prior), 0.0)
+    return _weights_of(solution, reward, features, prior)
 
 
 def sample_kl(weights: Float[Array, " n"], valid: Valid | None = None) -> Scalar:
@@ -181,24 +208,68 @@ def sample_kl(weights: Float[Array, " n"], valid: Valid | None = None) -> Scalar
     Raises:
         ValueError: If the shapes differ.
     """
-    prior = jnp.ones(weights.shape, weights.dtype) if valid is None else valid.astype(weights.dtype)
+    prior = jnp.ones_like(weights) if valid is None else checks.array("valid", valid)
     if weights.shape != prior.shape:
         raise ValueError(f"weights and valid have to have one shape, got {weights.shape} and {prior.shape}")
-    prior = _normalised(prior)
+    prior = _normalised(prior).astype(weights.dtype)
     # By terms of d log(d / p) - d + p, which are not negative: those of sum d log(d / p) would cancel.
     change = weights / jnp.where(prior > 0, prior, 1.0) - 1.0
     log_ratio = jnp.log1p(jnp.where(change > -1.0, change, 0.0))
     return jnp.sum(weights * log_ratio - prior * change, where=prior > 0)
 
 
+@jax.jit
+def _weights_of(solution: DualSolution, reward: Array, features: Array, prior: Array) -> Array:
+    return _weights(solution, _rescaled(reward, features, prior))
+
+
+def _weights(solution: DualSolution, samples: "_Samples") -> Array:
+    dtype = samples.reward.dtype
+    coef = solution.baseline_coef.astype(dtype)
+    coef = jnp.ldexp(coef, samples.feature_exponents - samples.reward_exponent)
+    temperature = jnp.ldexp(jnp.asarray(solution.temperature, dtype), -samples.reward_exponent)
+    temperature = jnp.maximum(temperature, jnp.finfo(dtype).tiny)
+    advantage = (samples.reward - exact_dot(samples.features, coef)) / temperature
+    weights = jnp.where(solution.is_informative, _softmax(advantage, samples.prior), samples.prior)
+    return jnp.where(samples.is_counted, weights, 0.0)
+
+
+def _solution(guess: "_Guess", unit: Array, samples: "_Samples", is_informative: Array) -> DualSolution:
+    """Return a point of the search in the units of the user, as far as the format can hold it."""
+    info = jnp.finfo(unit.dtype)
+    temperature = jnp.ldexp(unit * guess.temperature, samples.reward_exponent)
+    coef = jnp.ldexp(unit * guess.baseline_coef, samples.reward_exponent - samples.feature_exponents)
+    is_held = jnp.isfinite(temperature) & jnp.all(jnp.isfinite(coef))
+    return DualSolution(
+        temperature=jnp.clip(temperature, info.tiny, info.max),
+        baseline_coef=jnp.clip(coef, info.min, info.max),
+        grad_norm=jnp.zeros_like(unit),
+        num_steps=guess.num_steps,
+        is_active=guess.is_active & is_held & is_informative,
+        is_informative=is_informative,
+    )
+
+
 class _Samples(NamedTuple):
-    """Standardised samples; all rows that do not count are zero."""
+    """Samples in units that neither overflow nor underflow; all rows that do not count are zero."""
+
+    reward: Array  # less the largest: from -1 to 0
+    features: Array  # less their mean
+    prior: Array  # sums to one; zero where a sample does not count
+    is_counted: Array
+    reward_exponent: Array  # the unit of the rewards is two to this power
+    feature_exponents: Array  # and that of each feature
+    largest: Array  # size of the largest reward before the shift
+
+
+class _Standardised(NamedTuple):
+    """What the search works with."""
 
     reward: Array  # from -1 to 0
     centred: Array  # features less their mean
     whitening: Array
     whitened: Array  # centred @ whitening: uncorrelated features of mean square one
-    prior: Array  # sums to one; zero where a sample does not count
+    prior: Array
 
 
 class _Guess(NamedTuple):
@@ -213,7 +284,7 @@ class _Guess(NamedTuple):
     num_steps: Array
 
 
-def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
+def _first_guess(samples: _Standardised, kl_bound: Array) -> _Guess:
     """Return the solution for a small bound: a least-squares baseline, and the spread that it leaves."""
     coef = exact_dot(samples.whitening, exact_dot(samples.prior * samples.reward, samples.whitened))
     residual = samples.reward - exact_dot(samples.centred, coef)
@@ -221,7 +292,7 @@ def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
     # For a small bound the relative entropy is var(R - V) / (2 eta^2).
     temperature = jnp.sqrt(exact_dot(samples.prior, residual**2) / (2.0 * kl_bound))
     mean_size = -exact_dot(samples.prior, samples.reward)
-    floor = _RESOLUTION * jnp.where(mean_size > 0, mean_size, 1.0)
+    floor = _RESOLUTION * _eps(mean_size) * jnp.where(mean_size > 0, mean_size, 1.0)
     return _Guess(
         temperature=jnp.maximum(temperature, 2.0 * floor),
         baseline_coef=coef,
@@ -233,17 +304,27 @@ def _first_guess(samples: _Samples, kl_bound: Array) -> _Guess:
     )
 
 
-def _search(samples: _Samples, kl_bound: Array) -> _Guess:
+def _is_informative(first: _Guess, samples: _Standardised, threshold: Array) -> Array:
+    """Say whether a baseline, the best of all in the sense of least squares, leaves more than rounding."""
+    # Unlike the first guess this fit leaves out no direction that the format can tell from rounding.
+    residual = samples.reward - exact_dot(samples.centred, first.baseline_coef)
+    residual = residual - exact_dot(samples.prior, residual)
+    change = weighted_ridge(samples.centred, residual[:, None], samples.prior, ridge=0.0)[:, 0]
+    coef = first.baseline_coef + change
+    residual = samples.reward - exact_dot(samples.centred, coef)
+    residual = jnp.where(samples.prior > 0, residual - exact_dot(samples.prior, residual), 0.0)
+    sizes = exact_dot(jnp.abs(samples.centred), jnp.abs(coef))
+    rounding = _eps(sizes) * (_ROUNDING + _FIT_ROUNDING * jnp.max(sizes))
+    return jnp.max(jnp.abs(residual)) > rounding + jnp.where(threshold > 0, threshold, 0.0)
+
+
+def _search(first: _Guess, samples: _Standardised, kl_bound: Array) -> _Guess:
     """Improve a first guess, round by round; midway, give up a bound that is out of reach.
 
     One round is enough for well-behaved rewards. Where some are far worse than the others (falls), the scale
     and the baseline of all rewards say little of those that end up with a weight: each round takes both from
     the weights of the last.
     """
-    # No weights have more than all on the sample with the least prior. A bound far beyond that would drive
-    # the temperature down to where rounding decides; one nat beyond, it still does not count as met.
-    kl_bound = jnp.minimum(kl_bound, 1.0 - jnp.min(_log(samples.prior)))
-    first = _first_guess(samples, kl_bound)
 
     def is_going_on(search: tuple[_Guess, Array, Array]) -> Array:
         guess, _, num_rounds = search
@@ -254,7 +335,9 @@ def _search(samples: _Samples, kl_bound: Array) -> _Guess:
         # Rounding decides among greedy weights: start again, and stop a little short of them.
         is_given_up = (num_rounds == _NUM_ROUNDS) & _misses(guess, kl_bound)
         bound = jnp.where(is_given_up, _NEARLY_GREEDY * guess.kl, bound)
-        restart = first._replace(is_active=jnp.zeros((), bool), num_steps=guess.num_steps)
+        restart = first._replace(
+            is_settled=jnp.zeros((), bool), is_active=jnp.zeros((), bool), num_steps=guess.num_steps
+        )
         guess = jax.tree.map(lambda new, old: jnp.where(is_given_up, new, old), restart, guess)
         return _improve(guess, samples, bound), bound, num_rounds + 1
 
@@ -267,7 +350,7 @@ def _misses(guess: _Guess, kl_bound: Array) -> Array:
     return (guess.temperature <= 1.1 * guess.floor) | (guess.kl < 0.999 * kl_bound)
 
 
-def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
+def _improve(guess: _Guess, samples: _Standardised, kl_bound: Array) -> _Guess:
     """Standardise the rewards by the last guess, and minimise the dual function of what is left."""
     floor = _temperature_floor(guess, samples)
     unit = jnp.maximum(guess.temperature, 2.0 * floor)
@@ -299,33 +382,54 @@ def _improve(guess: _Guess, samples: _Samples, kl_bound: Array) -> _Guess:
     return improved._replace(is_settled=is_settled)
 
 
-def _temperature_floor(guess: _Guess, samples: _Samples) -> Array:
+def _temperature_floor(guess: _Guess, samples: _Standardised) -> Array:
     """Return the temperature below which rounding of the advantages would decide between samples."""
     # An advantage is a difference of these numbers and carries their rounding.
     size = jnp.abs(samples.reward) + exact_dot(jnp.abs(samples.centred), jnp.abs(guess.baseline_coef))
     mean_size = exact_dot(_weigh(guess, samples), size)
-    lowered = jnp.maximum(_RESOLUTION * mean_size, 1e-3 * guess.floor)
+    lowered = jnp.maximum(_RESOLUTION * _eps(mean_size) * mean_size, 1e-3 * guess.floor)
     return jnp.where(mean_size > 0, lowered, guess.floor)
 
 
-def _weigh(guess: _Guess, samples: _Samples) -> Array:
+def _weigh(guess: _Guess, samples: _Standardised) -> Array:
     return _softmax(_advantage(samples, guess.temperature, guess.baseline_coef), samples.prior)
 
 
-def _standardise(reward: Array, features: Array, prior: Array) -> tuple[_Samples, Array]:
-    """Return standardised samples, and the unit of their rewards."""
+def _rescaled(reward: Array, features: Array, prior: Array) -> _Samples:
+    """Shift rewards and centre features, in units that bear every number of the format."""
+    is_counted = _is_counted(reward, features, prior)
     reward, features, prior = _mask(reward, features, prior)
-    shifted = _shift(reward, prior)
-    spread = jnp.max(jnp.abs(shifted))
-    # Equal rewards have no spread: their unit is then that of their rounding.
-    rounding = jnp.finfo(reward.dtype).eps * jnp.max(jnp.abs(reward))
-    unit = jnp.where(spread > 0, spread, jnp.where(rounding > 0, rounding, 1.0))
-    centred = centre_columns(features, prior)
-    matrix = whitening(centred, prior, least_spread=_LEAST_SPREAD)
-    return _Samples(shifted / unit, centred, matrix, exact_dot(centred, matrix), prior), unit
+    largest = jnp.max(jnp.abs(reward))
+    # Powers of two round nothing. Half the size of the rewards, as a difference may be twice as large.
+    reward_exponent = jnp.frexp(largest)[1] + 1
+    feature_exponents = jnp.frexp(jnp.max(jnp.abs(features), axis=0))[1]
+    return _Samples(
+        reward=_shift(jnp.ldexp(reward, -reward_exponent), prior),
+        features=centre_columns(jnp.ldexp(features, -feature_exponents[None, :]), prior),
+        prior=prior,
+        is_counted=is_counted,
+        reward_exponent=reward_exponent,
+        feature_exponents=feature_exponents,
+        largest=jnp.ldexp(largest, -reward_exponent),
+    )
 
 
-def _advantage(samples: _Samples, temperature: Array, baseline_coef: Array) -> Array:
+def _standardise(samples: _Samples) -> tuple[_Standardised, Array]:
+    """Return standardised samples, and the unit of their rewards."""
+    spread = jnp.max(jnp.abs(samples.reward))
+    unit = jnp.where(spread > 0, spread, 1.0)
+    # Features whose coefficients the format cannot hold are left out.
+    exponents = samples.feature_exponents + jnp.frexp(jnp.max(jnp.abs(samples.features), axis=0))[1]
+    exponents = samples.reward_exponent + jnp.frexp(unit)[1] - exponents
+    is_usable = jnp.abs(exponents) < jnp.finfo(unit.dtype).maxexp - _SPARE_EXPONENTS
+    centred = jnp.where(is_usable[None, :], samples.features, 0.0)
+    # Directions with less spread are left out: in V they would be differences of large numbers.
+    matrix = whitening(centred, samples.prior, least_spread=jnp.sqrt(_eps(unit)))
+    whitened = exact_dot(centred, matrix)
+    return _Standardised(samples.reward / unit, centred, matrix, whitened, samples.prior), unit
+
+
+def _advantage(samples: _Standardised, temperature: Array, baseline_coef: Array) -> Array:
     return (samples.reward - exact_dot(samples.centred, baseline_coef)) / temperature
 
 
@@ -358,32 +462,82 @@ def _mask(reward: Array, features: Array, prior: Array) -> tuple[Array, Array, A
     prior = jnp.where(counts, prior, 0.0)
     reward = jnp.where(counts, reward, 0.0)
     features = jnp.where(counts[:, None], features, 0.0)
-    return reward, features, _normalised(jnp.where(jnp.any(counts), prior, 1.0))
+    prior = _normalised(jnp.where(jnp.any(counts), prior, 1.0))  # in its own format, then in that of the rest
+    return reward, features, prior.astype(reward.dtype)
 
 
 def _normalised(weights: Array) -> Array:
-    """Scale weights, if there are any, to a sum of one; those that are too small for the format get zero."""
-    # By the largest first: a sum of large ones overflows.
-    largest = jnp.max(weights)
-    weights = weights / jnp.where(largest > 0, largest, 1.0)
-    weights = weights / jnp.maximum(jnp.sum(weights), 1.0)
-    return jnp.where(weights >= jnp.finfo(weights.dtype).tiny, weights, 0.0)
+    """Scale weights of any size, if there are any, to a sum of one; relatively tiny ones become zero."""
+    info, bits = jnp.finfo(weights.dtype), _bits(weights)
+    # Compiled code reads denormal numbers as zero, and divides by multiplying with a reciprocal, which is one
+    # for large divisors. As an integer a denormal number is itself in units of the smallest one.
+    is_denormal = (bits > 0) & (bits < 1 << info.nmant)
+    readable = jnp.where(is_denormal, bits.astype(weights.dtype), weights)
+    exponent = jnp.where(is_denormal, info.minexp - info.nmant, 0)
+    largest = jnp.max(jnp.where(bits > 0, jnp.frexp(readable)[1] + exponent, -(2**30)))
+    weights = jnp.where(bits > 0, jnp.ldexp(readable, exponent - largest), 0.0)  # the largest is about one
+    weights = weights / jnp.maximum(jnp.sum(weights), 0.5)
+    return jnp.where(weights >= info.tiny, weights, 0.0)
+
+
+def _bits(values: Array) -> Array:
+    """Return numbers as integers of the same bits: above zero where and only where the number is."""
+    return lax.bitcast_convert_type(values, jnp.dtype(f"int{jnp.finfo(values.dtype).bits}"))
 
 
 def _is_counted(reward: Array, features: Array, prior: Array) -> Array:
-    return (prior > 0) & jnp.isfinite(prior) & jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
+    is_known = jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
+    return (_bits(prior) > 0) & jnp.isfinite(prior) & is_known
 
 
-def _checked_samples(reward: Array, features: Array, valid: Array | None) -> tuple[Array, Array, Array]:
-    """Return rewards, features and how much each sample counts, by default equally, after checking shapes."""
+def _eps(*values: Any) -> float:
+    """Return the rounding of the coarsest format of these arrays, among those that are floats."""
+    kinds = [getattr(x, "dtype", np.dtype(bool)) for x in values]
+    kinds = [kind for kind in kinds if jnp.issubdtype(kind, jnp.floating)]
+    return max(float(jnp.finfo(kind).eps) for kind in kinds)
+
+
+def _without_offset(reward: Any, valid: Any) -> tuple[Any, float | None]:
+    """Subtract the largest reward before jax narrows float64, as rewards with a large offset need it.
+
+    Returns:
+        The rewards, and the size of their rounding; as they are, and None, if there is nothing to narrow.
+    """
+    values = None if isinstance(reward, jax.Array) else _on_host(reward)
+    is_wide = values is not None and (values.dtype.kind in "iu" or values.dtype == np.float64)
+    if values is None or not is_wide or values.ndim != 1:
+        return reward, None
+    values = values.astype(np.float64)
+    counts, prior = np.abs(values) <= checks.FLOAT32_MAX, None if valid is None else _on_host(valid)
+    if prior is not None and prior.shape == values.shape and prior.dtype.kind in "biuf":
+        counts = counts & (prior > 0)
+    known = values[counts]
+    # What spreads over all of the format loses nothing by an offset.
+    if known.size == 0 or known.max() - known.min() > checks.FLOAT32_MAX:
+        return values, None
+    return values - known.max(), _ROUNDING * _eps(values) * float(np.max(np.abs(known)))
+
+
+def _on_host(values: Any) -> np.ndarray | None:
+    """Return an array of NumPy, None where values are traced or are no array."""
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError):
+        return None
+
+
+def _checked_samples(reward: Any, features: Any, valid: Any) -> tuple[Array, Array, Array]:
+    """Return rewards and features in one format, and how much each sample counts, after checking shapes."""
     reward, features = checks.array("reward", reward), checks.array("features", features)
     if reward.ndim != 1 or features.ndim != 2 or features.shape[0] != reward.shape[0] or 0 in features.shape:
         raise ValueError(
             f"reward must have shape (n,) and features (n, m), got shapes {reward.shape} and {features.shape}"
         )
+    dtype = max(reward.dtype, features.dtype, key=lambda kind: kind.itemsize)
+    reward, features = reward.astype(dtype), features.astype(dtype)
     if valid is None:
-        return reward, features, jnp.ones(reward.shape, reward.dtype)
-    return reward, features, checks.array("valid", valid, reward.shape).astype(reward.dtype)
+        return reward, features, jnp.ones_like(reward)
+    return reward, features, checks.array("valid", valid, reward.shape)
 
 
 def _checked_solution(solution: DualSolution, features: Array) -> DualSolution:

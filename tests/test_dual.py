@@ -252,16 +252,6 @@ def test_traced_once():
 # What cannot be solved.
 
 
-@pytest.mark.parametrize("value", [0.0, 3.0, -1e9, 1e-9])
-def test_equal_rewards_give_equal_weights(value):
-    _, features, _ = samples()
-    solution, weights = solve_all(np.full(NUM, value), features)
-    assert_finite(solution, weights)
-    assert not bool(solution.is_active)
-    assert float(solution.temperature) > 0
-    np.testing.assert_allclose(weights, 1 / NUM, rtol=1e-5)
-
-
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kl_bound", [5.0, 50.0, 1e8])
 def test_bound_out_of_reach_gives_nearly_greedy_weights_that_keep_the_features(kl_bound, seed):
@@ -425,14 +415,6 @@ def test_a_small_prior_with_a_large_reward_breaks_nothing(key, small, gap):
     assert jnp.isfinite(hessian).all()
 
 
-@pytest.mark.parametrize("scale", [1e-30, 1e37])
-def test_the_scale_of_a_prior_does_not_matter(key, scale):
-    reward, features = jax.random.normal(key, (NUM,)), jnp.linspace(-1.0, 1.0, NUM)[:, None]
-    expected = solve_dual(reward, features, kl_bound=0.5)
-    found = solve_dual(reward, features, jnp.full(NUM, scale), kl_bound=0.5)
-    np.testing.assert_allclose(found.temperature, expected.temperature, rtol=1e-4)
-
-
 @pytest.mark.usefixtures("compiled_as_for_users")
 def test_vmap_equals_loop():
     batches = [samples(seed) for seed in range(4)]
@@ -447,3 +429,258 @@ def test_vmap_equals_loop():
         rounding = 1e-3 if i < 3 else 0.1  # of the relative entropy of greedy weights, which sets the last
         np.testing.assert_allclose(solutions.temperature[i], alone.temperature, rtol=rounding)
         np.testing.assert_allclose(weights[i], alone_weights, atol=rounding / 10)
+
+
+# Differences of rewards.
+
+
+@pytest.mark.parametrize("convert", [np.asarray, list], ids=["array", "list"])
+@pytest.mark.parametrize("offset", [-1e9, 1e3, 1e6, 1e7, 1e8, 1e9])
+def test_an_offset_of_float64_rewards_changes_no_weight(offset, convert):
+    _, features, reward = samples()
+    features = jnp.float32(features)
+    expected = sample_weights(solve_dual(reward, features, kl_bound=0.5), reward, features)
+    given = convert(reward + offset)
+    solution = solve_dual(given, features, kl_bound=0.5)
+    weights = sample_weights(solution, given, features)
+    assert bool(solution.is_informative) and bool(solution.is_active)
+    np.testing.assert_allclose(weights, expected, rtol=1e-3, atol=1e-9)
+
+
+def test_an_offset_of_whole_rewards_changes_no_weight():
+    _, features, _ = samples()
+    features, reward = jnp.float32(features), np.random.default_rng(8).integers(0, 20, NUM)
+    weights = [
+        sample_weights(solve_dual(given, features, kl_bound=0.5), given, features)
+        for given in (reward.astype(np.float32), reward + 2**40, (reward - 2**40).tolist())
+    ]
+    for shifted in weights[1:]:
+        np.testing.assert_allclose(shifted, weights[0], rtol=1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [1e30, 1e300, np.inf, np.nan])
+def test_samples_that_do_not_count_take_no_digits_of_the_others(bad):
+    _, features, reward = samples()
+    features, valid = jnp.float32(features), np.arange(NUM) > 0
+    expected = sample_weights(solve_dual(reward, features, valid, kl_bound=0.5), reward, features, valid)
+    hidden = np.where(valid, reward + 1e8, bad)
+    solution = solve_dual(hidden, features, valid, kl_bound=0.5)
+    np.testing.assert_allclose(
+        sample_weights(solution, hidden, features, valid), expected, rtol=1e-3, atol=1e-9
+    )
+
+
+def span(kind, context, num_features):
+    """Return features that may be wide, nearly collinear, or on an offset."""
+    if kind == "monomials":
+        return np.column_stack([context ** (i + 1) for i in range(num_features)])
+    if kind == "offset":
+        return np.column_stack([1e3 + context, *(np.sin(3 * i * context) for i in range(1, num_features))])
+    return radial(context, num_features, {"radial": None, "wide radial": 0.3}[kind])
+
+
+@pytest.mark.parametrize("kind", ["radial", "wide radial", "monomials", "offset"])
+@pytest.mark.parametrize("offset", [0.0, 1e2, 1e5])
+@pytest.mark.parametrize("num_features", [2, 6, 11])
+def test_rewards_that_the_baseline_explains_leave_the_prior(kind, offset, num_features):
+    rng = np.random.default_rng(9)
+    features = np.float32(span(kind, rng.uniform(size=NUM), num_features))
+    reward = features @ np.float32(rng.normal(size=num_features) + offset)
+    assert_gives_the_prior(reward, features)
+
+
+def assert_gives_the_prior(reward, features, valid=None, **settings):
+    reward, features = jnp.asarray(reward, jnp.float32), jnp.asarray(features, jnp.float32)
+    valid = jnp.ones(reward.shape, bool) if valid is None else jnp.asarray(valid)
+    solution = solve_dual(reward, features, valid, **({"kl_bound": 0.5} | settings))
+    weights = sample_weights(solution, reward, features, valid)
+    assert_finite(solution, weights)
+    assert not bool(solution.is_informative) and not bool(solution.is_active)
+    assert float(solution.temperature) > 0 and float(sample_kl(weights, valid)) == 0.0
+    assert np.unique(np.asarray(weights)[np.asarray(valid)]).size == 1
+    assert float(solution.grad_norm) < 1e-6
+
+
+@pytest.mark.parametrize("value", [0.0, 3.0, -1e9, 1e-9, 3e38, 1e-40])
+def test_equal_rewards_leave_the_prior(value):
+    assert_gives_the_prior(np.full(NUM, value), samples()[1], np.arange(NUM) % 3 > 0)
+
+
+@pytest.mark.parametrize("num_valid", range(1, NUM_FEATURES + 1))
+def test_as_few_samples_as_features_leave_the_prior(num_valid):
+    _, features, reward = samples()
+    assert_gives_the_prior(reward, features, np.arange(NUM) < num_valid)
+
+
+def test_a_prior_is_returned_as_it_is():
+    features, prior = jnp.float32(samples()[1]), jnp.linspace(0.0, 3.0, NUM)
+    solution = solve_dual(jnp.full(NUM, 7.0), features, prior, kl_bound=0.5)
+    weights = sample_weights(solution, jnp.full(NUM, 7.0), features, prior)
+    np.testing.assert_allclose(weights, prior / prior.sum(), rtol=1e-6)
+    assert float(sample_kl(weights, prior)) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("offset", "is_informative"),
+    [(0.0, True), (1e3, True), (1e6, True), (-1e7, True), (1e7, True), (1e8, False), (1e9, False)],
+)
+def test_small_differences_count_until_the_format_loses_them(offset, is_informative):
+    _, features, _ = samples()
+    reward = np.float32(offset + np.random.default_rng(10).normal(size=NUM))
+    solution, weights = solve_all(reward, features)
+    assert bool(solution.is_informative) == bool(solution.is_active) == is_informative
+    assert dual_scipy.kl_to_uniform(weights) == pytest.approx(0.5 * is_informative, rel=1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_the_caller_knows_which_differences_are_rounding(scale):
+    _, features, reward = samples()
+    spread = scale * np.ptp(reward)
+    solution = solve_dual(
+        jnp.float32(scale * reward), jnp.float32(features), kl_bound=0.5, resolution=1e-3 * spread
+    )
+    assert bool(solution.is_informative)
+    assert_gives_the_prior(scale * reward, features, resolution=spread)
+
+
+@pytest.mark.parametrize("resolution", [-1.0, np.nan, np.inf])
+def test_bad_resolution_is_named(resolution):
+    with pytest.raises(ValueError, match=f"resolution must be finite and at least 0, got {resolution}"):
+        solve_dual(jnp.zeros(3), jnp.zeros((3, 2)), kl_bound=0.5, resolution=resolution)
+
+
+@pytest.mark.parametrize("bound", [0.0, -0.0, -1.0, np.nan, -np.inf, 1e-42])
+def test_a_traced_bound_that_is_no_positive_number_leaves_the_prior(bound):
+    _, features, reward = samples()
+    solution, weights = solve_all(reward, features, bound)
+    assert_finite(solution, weights)
+    assert float(solution.temperature) > 0 and not bool(solution.is_active)
+    assert np.unique(weights).size == 1 and float(sample_kl(jnp.float32(weights))) == 0.0
+
+
+# Double precision.
+
+
+@pytest.mark.parametrize(
+    ("reward_dtype", "feature_dtype", "valid_dtype"),
+    [
+        (np.float32, np.float64, bool),
+        (np.float64, np.float32, np.float32),
+        (np.float32, np.float32, np.float64),
+        (np.float64, np.float64, np.float32),
+        (np.float32, np.float64, np.float64),
+    ],
+)
+def test_formats_may_be_mixed(reward_dtype, feature_dtype, valid_dtype):
+    _, features, reward = samples()
+    with jax.enable_x64(True):
+        given = jnp.asarray(reward, reward_dtype), jnp.asarray(features, feature_dtype)
+        valid = jnp.ones(NUM, valid_dtype)
+        bounds = 0.5, np.float64(0.5), jnp.float32(0.5), jnp.float64(0.5)
+        solutions = [solve_dual(*given, valid, kl_bound=bound) for bound in bounds]
+        for solution in solutions:
+            assert solution.temperature.dtype == max(reward_dtype, feature_dtype, key=lambda x: x(0).itemsize)
+            weights = sample_weights(solution, *given, valid)
+            np.testing.assert_allclose(sample_kl(weights, valid), 0.5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kl_bound", [1e-6, 0.5, 2.0])
+def test_minimum_in_float64_is_that_of_scipy(kl_bound):
+    _, features, reward = samples()
+    temperature, _, expected = dual_scipy.solve(reward, features, kl_bound)
+    with jax.enable_x64(True):
+        given = jnp.float64(reward), jnp.float64(features)
+        solution = solve_dual(*given, kl_bound=kl_bound)
+        weights = np.asarray(sample_weights(solution, *given))
+    assert float(solution.temperature) == pytest.approx(temperature, rel=1e-5)
+    np.testing.assert_allclose(weights, expected, rtol=1e-4)
+    assert dual_scipy.kl_to_uniform(weights) == pytest.approx(kl_bound, rel=1e-8)
+    assert float(solution.grad_norm) < 1e-12
+
+
+@pytest.mark.parametrize("name", EXTREME)
+def test_constraints_hold_for_extreme_rewards_in_float64(name):
+    _, features, _ = samples()
+    reward = EXTREME[name](np.random.default_rng(3))
+    with jax.enable_x64(True):
+        solution, weights = solve(
+            jnp.float64(reward), jnp.float64(features), jnp.ones(NUM, bool), jnp.float64(0.5)
+        )
+    assert bool(solution.is_active)
+    assert dual_scipy.kl_to_uniform(np.asarray(weights)) == pytest.approx(0.5, rel=1e-6)
+    assert float(solution.grad_norm) < 1e-6
+
+
+# Numbers of any size.
+
+
+def solve_eagerly_and_compiled(reward, features, valid):
+    """Return both answers, after checking that they are finite and say the same."""
+    reward, features, valid = (jnp.asarray(x, jnp.float32) for x in (reward, features, valid))
+    solution = solve_dual(reward, features, valid, kl_bound=0.5)
+    eager = solution, sample_weights(solution, reward, features, valid)
+    compiled = solve(reward, features, valid, jnp.float32(0.5))
+    for solution, weights in (eager, compiled):
+        assert_finite(solution, weights)
+        assert float(solution.temperature) > 0
+        np.testing.assert_allclose(np.sum(np.asarray(weights, np.float64)), 1.0, atol=1e-5)
+        assert float(sample_kl(weights, valid)) < 0.5 * (1 + 1e-3)
+    np.testing.assert_allclose(eager[0].temperature, compiled[0].temperature, rtol=1e-4)
+    np.testing.assert_allclose(eager[1], compiled[1], rtol=1e-3, atol=1e-7)
+    return compiled
+
+
+@pytest.mark.usefixtures("compiled_as_for_users")
+@pytest.mark.parametrize("scale", [3.4e38, 9e37, 1e37, 1e-30, 1e-37, 1e-38, 1e-40, 1e-43, 1.4e-45])
+@pytest.mark.parametrize("is_uniform", [True, False])
+def test_only_the_ratios_of_a_prior_matter(scale, is_uniform):
+    _, features, reward = samples()
+    ratio = np.ones(NUM) if is_uniform else np.random.default_rng(7).choice([1.0, 0.5, 0.0], size=NUM)
+    # What the format makes of small ones.
+    prior = np.float32(ratio) * np.float32(scale)
+    assert prior.any()
+    solution, weights = solve_eagerly_and_compiled(reward, features, prior)
+    expected, expected_weights = solve_eagerly_and_compiled(
+        reward, features, np.float64(prior) / np.float64(prior.max())
+    )
+    np.testing.assert_allclose(solution.temperature, expected.temperature, rtol=1e-4)
+    np.testing.assert_allclose(weights, expected_weights, rtol=1e-3, atol=1e-7)
+    assert np.all((np.asarray(weights) > 0) == (prior > 0))
+
+
+HUGE = {
+    "both ends": lambda reward: np.where(np.arange(NUM) % 2, 3e38, -3e38),
+    "all large": lambda reward: 1e37 * reward,
+    "all at the end": lambda reward: np.full(NUM, 3.4e38),
+    "one up": lambda reward: np.where(np.arange(NUM) == 3, 1e38, reward),
+    "one down": lambda reward: np.where(np.arange(NUM) == 3, -3.4e38, reward),
+    "one each way": lambda reward: np.where(np.arange(NUM) < 2, [3.4e38, -3.4e38] * (NUM // 2), reward),
+    "all magnitudes": lambda reward: np.sign(reward + 1) * 10.0 ** np.linspace(-38, 38, NUM),
+    "ordinary": lambda reward: reward,
+    "tiny": lambda reward: 1e-30 * reward,
+}
+UNITS = {
+    "one": np.ones(NUM_FEATURES),
+    "large": np.full(NUM_FEATURES, 1e30),
+    "tiny": np.full(NUM_FEATURES, 1e-30),
+    "at the ends": np.array([3e38, 1e-37, 1.0, 1e38, 1e-38]),
+    "mixed": np.array([1e30, 1e-30, 1.0, 1e15, 1e-15]),
+}
+
+
+@pytest.mark.usefixtures("compiled_as_for_users")
+@pytest.mark.parametrize("unit", UNITS)
+@pytest.mark.parametrize("name", HUGE)
+def test_what_is_finite_has_a_finite_answer(name, unit):
+    _, features, reward = samples()
+    solve_eagerly_and_compiled(HUGE[name](reward), features * UNITS[unit], np.ones(NUM))
+
+
+@pytest.mark.parametrize("exponent", [-90, 90])
+def test_units_of_features_change_no_weight(exponent):
+    _, features, reward = samples()
+    features, units = np.float32(features), 2.0 ** (exponent * np.array([1, -1, 0, 1, 0]))
+    solution, weights = solve_all(reward, features * units)
+    expected, expected_weights = solve_all(reward, features)
+    np.testing.assert_array_equal(weights, expected_weights)
+    np.testing.assert_array_equal(solution.baseline_coef * np.float32(units), expected.baseline_coef)
