@@ -11,7 +11,7 @@ import math
 import jax.numpy as jnp
 from jax.scipy.special import erfc
 
-from creps_jax.linalg import centre_columns, exact_dot
+from creps_jax.linalg import centre_columns, exact_dot, whitening
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
 __all__ = ["blended_cov_chol", "independence_p_value", "share_of_evidence"]
@@ -51,7 +51,7 @@ def independence_p_value(
     prior = prior / jnp.where(total > 0, total, 1.0)
     change = jnp.where(prior > 0, weights - prior, 0.0)
     noise, num_features, num_directions = _whitened_noise(prior, features, theta)
-    squares = jnp.where((prior > 0)[:, None], noise**2, 0.0)
+    squares = noise**2
     sums = jnp.sum(squares, axis=1, keepdims=True)
 
     num_samples = 1.0 / jnp.maximum(jnp.sum(prior**2), jnp.finfo(prior.dtype).tiny)
@@ -90,21 +90,19 @@ def blended_cov_chol(
 def _whitened_noise(prior: Array, features: Array, theta: Array) -> tuple[Array, Scalar, Scalar]:
     """Return what a regression on the features leaves of the parameters, whitened, and two numbers: of
     independent features, a constant included, and of independent directions of the parameters."""
-    root = jnp.sqrt(prior)[:, None]
-    columns = jnp.concatenate(
-        [jnp.ones_like(root), centre_columns(features, prior), centre_columns(theta, prior)], axis=1
-    )
-    size = jnp.max(jnp.abs(columns), axis=0)
-    columns = root * (columns / jnp.where(size > 0, size, 1.0)[None, :])
-    # Each column of the factor is what the columns before it do not explain.
-    orthogonal, triangular = jnp.linalg.qr(columns)
-    length = jnp.linalg.norm(triangular, axis=0)[: triangular.shape[0]]
-    is_own = jnp.abs(jnp.diagonal(triangular)) > _LEAST_SPREAD * jnp.where(length > 0, length, 1.0)
-    noise = jnp.where(is_own[None, :], orthogonal / jnp.where(root > 0, root, 1.0), 0.0)
-    num_features = 1 + features.shape[1]
-    of_features, of_theta = is_own[:num_features], is_own[num_features:]
-    count = lambda is_one: jnp.sum(is_one, dtype=prior.dtype)  # noqa: E731
-    return noise[:, num_features:], count(of_features), count(of_theta)
+    white_features, num_features = _whitened(features, prior)
+    centred = centre_columns(theta, prior)
+    explained = exact_dot(white_features, exact_dot(white_features.T, prior[:, None] * centred))
+    noise, num_directions = _whitened(centred - explained, prior)
+    return noise, 1.0 + num_features, num_directions
+
+
+def _whitened(columns: Array, prior: Array) -> tuple[Array, Scalar]:
+    """Return uncorrelated columns of mean zero and mean square one, zeros in place of those that depend on
+    others, and how many there are."""
+    centred = centre_columns(columns, prior)
+    matrix = whitening(centred, prior, least_spread=_LEAST_SPREAD)
+    return exact_dot(centred, matrix), jnp.sum(jnp.any(matrix != 0, axis=0), dtype=prior.dtype)
 
 
 def _standardised(columns: Array, prior: Array) -> Array:
