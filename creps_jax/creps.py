@@ -191,7 +191,7 @@ class Creps:
     @functools.cached_property
     def programs(self) -> "Programs":
         """The compiled programs of these settings."""
-        settings = dataclasses.replace(self, kl_bound=0.0)
+        settings = dataclasses.replace(self, kl_bound=np.float32(0))
         identity = tuple(getattr(settings, field.name) for field in dataclasses.fields(settings))
         try:
             found = _PROGRAMS.get(identity)
@@ -320,7 +320,8 @@ def creps(
     return Creps(
         policy_features=policy_features,
         baseline_features=baseline_features,
-        kl_bound=kl_bound,
+        # Of one type, whatever kind of number it was: another type would be compiled for anew.
+        kl_bound=kl_bound if isinstance(kl_bound, jax.Array) else np.float32(kl_bound),
         archive_size=archive_size,
         ridge=ridge,
         m_step=m_step,

@@ -257,7 +257,7 @@ def _program(algorithm: Creps, function: Callable, *static: Any) -> Callable:
     programs = algorithm.programs.others
     if (function, *static) not in programs:
         # A copy: the program must not keep alive the algorithm that keeps it.
-        settings = dataclasses.replace(algorithm, kl_bound=0.0)
+        settings = dataclasses.replace(algorithm, kl_bound=np.float32(0))
 
         def program(kl_bound: ScalarLike, key: Array, state: CrepsState) -> Any:
             return function(*static, dataclasses.replace(settings, kl_bound=kl_bound), key, state)
