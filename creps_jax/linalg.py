@@ -13,9 +13,12 @@ from creps_jax.typing import Array, Float, ScalarLike
 __all__ = [
     "centre_columns",
     "exact_dot",
+    "normalised",
     "safe_cholesky",
+    "safe_norm",
+    "safe_sqrt",
     "thomas_solve",
-    "unbiased_normaliser",
+    "weighted_mean",
     "weighted_ridge",
     "whitening",
 ]
@@ -90,7 +93,6 @@ def weighted_ridge(
     *,
     ridge: ScalarLike,
     scale: Float[Array, " p"] | None = None,
-    free: Float[Array, " p"] | None = None,
 ) -> Float[Array, "p d"]:
     """Fit targets by a linear function of features under a ridge relative to the size of each feature.
 
@@ -106,15 +108,12 @@ def weighted_ridge(
             keeps the fit finite with collinear features or fewer samples than features.
         scale: Size of each feature, above zero; by default the root of its weighted mean square. A feature
             that is nearly zero on all samples is then hardly penalised: where it can be large, say so.
-        free: Coefficients whose multiples are not penalised, those of an intercept; by default all are.
 
     Returns:
         The coefficients B.
 
     Raises:
         ValueError: If the numbers of samples differ.
-
-    Source: Abdolmaleki et al. 2016, Eq. 14.
     """
     num_samples, num_features = features.shape
     if targets.shape[0] != num_samples or weights.shape != (num_samples,):
@@ -122,41 +121,56 @@ def weighted_ridge(
             "weighted_ridge needs features (n, p), targets (n, d) and weights (n,), "
             f"got shapes {features.shape}, {targets.shape} and {weights.shape}"
         )
-    for name, vector in (("scale", scale), ("free", free)):
-        if vector is not None and vector.shape != (num_features,):
-            raise ValueError(f"{name} has to have shape ({num_features},), got {vector.shape}")
+    if scale is not None and scale.shape != (num_features,):
+        raise ValueError(f"scale must have shape ({num_features},), got {scale.shape}")
     eps = jnp.finfo(features.dtype).eps
     is_weighted = (weights > 0)[:, None]
     total = jnp.sum(weights)
-    root = jnp.sqrt(jnp.where(is_weighted, weights[:, None], 0.0) / jnp.where(total > 0, total, 1.0))
+    root = safe_sqrt(jnp.where(is_weighted, weights[:, None], 0.0) / jnp.where(total > 0, total, 1.0))
     rows = root * jnp.where(is_weighted, features, 0.0)
     values = root * jnp.where(is_weighted, targets, 0.0)
-    size = jnp.linalg.norm(rows, axis=0) if scale is None else scale
+    size = safe_sqrt(jnp.sum(rows**2, axis=0)) if scale is None else scale
     size = jnp.asarray(jnp.where(size > 0, size, 1.0))
     damping, least = jnp.sqrt(jnp.asarray(ridge, features.dtype)), math.sqrt(num_features) * 4.0 * eps
-    penalty = jnp.eye(num_features, dtype=features.dtype)
-    if free is not None:
-        free = free * size
-        square = jnp.sum(free**2)
-        penalty = penalty - free[:, None] * free[None, :] / jnp.where(square > 0, square, 1.0)
-    penalty = damping * penalty + least * jnp.eye(num_features, dtype=features.dtype)
-    orthogonal, triangular = jnp.linalg.qr(jnp.concatenate([rows / size[None, :], penalty]))
-    projected = exact_dot(orthogonal[:num_samples].T, values)
-    return jax.scipy.linalg.solve_triangular(triangular, projected) / size[:, None]
+    # Beside the features the targets Y turn to Q' Y, for which Q is not needed. Their own rows of the penalty
+    # change nothing: the factor has an inverse, and with it a gradient, where features fit the targets.
+    penalty = jnp.full(num_features + targets.shape[1], least, features.dtype).at[:num_features].add(damping)
+    both = jnp.concatenate([rows / size[None, :], values], axis=1)
+    triangular = jnp.linalg.qr(jnp.concatenate([both, jnp.diag(penalty)]), mode="r")[:num_features]
+    left, right = triangular[:, :num_features], triangular[:, num_features:]
+    return jax.scipy.linalg.solve_triangular(left, right) / size[:, None]
 
 
-def unbiased_normaliser(weights: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return what makes a weighted covariance unbiased, for weights that sum to one.
+def normalised(weights: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Divide weights, not negative, by their sum, which may be too large for the format; zeros stay zeros.
 
-    Args:
-        weights: Weights d of the samples, not negative.
-
-    Returns:
-        Z = 1 - sum d^2; not the zero that a single sample makes it, but the resolution of the format.
-
-    Source: Abdolmaleki et al. 2016, Eq. 15.
+    Numbers too small to be normal are zeros to XLA, and so are reciprocals of the largest, which it
+    multiplies by where division is asked for: weights are first taken to the middle of their range.
     """
-    return jnp.maximum(1.0 - jnp.sum(weights**2), jnp.finfo(weights.dtype).eps)
+    is_large = jnp.max(weights) > 1.0
+    weights = weights * jnp.where(is_large, jnp.asarray(2.0**-64, weights.dtype), 2.0**64)
+    largest = lax.stop_gradient(jnp.max(weights))  # it cancels
+    weights = weights / jnp.where(largest > 0, largest, 1.0)
+    total = jnp.sum(weights)
+    return weights / jnp.where(total > 0, total, 1.0)
+
+
+def weighted_mean(rows: Float[Array, "n m"], weights: Float[Array, " n"]) -> Float[Array, " m"]:
+    """Return the mean of finite rows, for weights that sum to one, or zero if all weights are zero."""
+    middle = exact_dot(weights, rows)
+    # The first sum is rounded in units of the offset of the rows, as often as there are rows.
+    return middle + exact_dot(weights, rows - middle[None, :])
+
+
+def safe_sqrt(values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the root of values, and zero, with a gradient of zero, where they are not positive."""
+    is_positive = values > 0
+    return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, values, 1.0)), 0.0)
+
+
+def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
+    """Return the length of a vector, with a gradient of zero where it is zero."""
+    return safe_sqrt(jnp.sum(vector**2))
 
 
 def safe_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
@@ -185,7 +199,8 @@ def safe_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     size = matrix.shape[0]
     # Eigenvalues carry an error of about d eps; the smallest has to be above it for the factor to exist.
     least = 4.0 * size * jnp.finfo(matrix.dtype).eps
-    jitter = jnp.maximum(least - jnp.linalg.eigvalsh(unit)[0], 0.0)
+    # Where eigenvalues coincide they have no gradient, and what is added is no more than rounding.
+    jitter = lax.stop_gradient(jnp.maximum(least - jnp.linalg.eigvalsh(unit)[0], 0.0))
     return jnp.linalg.cholesky(unit + jitter * jnp.eye(size, dtype=matrix.dtype)) * jnp.sqrt(scale)
 
 

@@ -5,6 +5,7 @@ moves farther: with 50 samples of 20 parameters by some 10 nats where 1 was allo
 few samples say too much about the covariance. The bounded fit keeps the promise.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,8 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from creps_jax import checks
-from creps_jax.linalg import exact_dot, unbiased_normaliser
+from creps_jax.linalg import exact_dot
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
+from creps_jax.regression import Regression, as_coefficients, coordinates, gauge, normaliser, regress
 from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
 
 __all__ = ["MStep", "WeightedSamples", "bounded_ml", "weighted_ml"]
@@ -71,9 +73,9 @@ def bounded_ml(
     The mean that is likeliest within its bound, at the old covariance, is, in features that are uncorrelated
     over the contexts and along the eigenvectors of their weighted mean square g, a share `g / (g + l)` of
     the whole way, with a multiplier l. The whole way is that of `weighted_ml`, with its ridge. The covariance
-    that is likeliest within its bounds is, along the eigenvectors of the weighted covariance s (made unbiased
-    as in Eq. 15), the root x of `l x^2 - (l + m - 1) x - s = 0`, where m is the multiplier of the bound on
-    the loss of entropy. No spread falls below the rounding of theta.
+    that is likeliest within its bounds is, along the eigenvectors of the weighted covariance s (made
+    unbiased, as in `fit_weighted_ml`), the root x of `l x^2 - (l + m - 1) x - s = 0`, where m is the
+    multiplier of the bound on the loss of entropy. No spread falls below the rounding of theta.
 
     Args:
         mean_kl_bound: Largest part of the mean in the relative entropy, nats.
@@ -97,33 +99,56 @@ def bounded_ml(
     for name, bound in bounds.items():
         checks.number(name, bound, above=0.0)
 
-    def m_step(
+    return BoundedML(mean_kl_bound, cov_kl_bound, entropy_loss_bound)
+
+
+@dataclasses.dataclass(frozen=True)
+class BoundedML:
+    """The M-step of `bounded_ml`: its bounds as data, so that equal ones share programs and can be pickled."""
+
+    mean_kl_bound: float
+    cov_kl_bound: float
+    entropy_loss_bound: float | None
+
+    def __call__(
+        self,
         policy: LinearGaussian,
         samples: WeightedSamples,
         *,
         ridge: ScalarLike,
         scale: Float[Array, " p"] | None = None,
     ) -> LinearGaussian:
-        likeliest = weighted_ml(policy, samples, ridge=ridge, scale=scale)
-        coef = _bounded_mean(policy, likeliest.coef, samples, mean_kl_bound)
-        return LinearGaussian(
-            coef, _bounded_cov_chol(policy, coef, samples, cov_kl_bound, entropy_loss_bound)
-        )
+        """Fit within the bounds; see `fit_weighted_ml` for the settings."""
+        checks.instance("policy", policy, LinearGaussian)
+        checks.instance("samples", samples, WeightedSamples)
+        features, theta, weights, _ = samples
+        fit = regress(features, theta, weights, ridge=ridge, scale=scale, start=policy.coef)
+        old_chol = policy.cov_chol / fit.size[:, None]
+        change, unbiased = _bounded_change(fit, old_chol, samples, self.mean_kl_bound)
+        residual = fit.rest - exact_dot(fit.rows, change.at[0].add(-fit.centre))
+        residual = jax.scipy.linalg.solve_triangular(old_chol, residual.T, lower=True).T
+        scatter = exact_dot(residual.T, residual) / unbiased  # Eq. 15
+        factor = _bounded_factor(scatter, self.cov_kl_bound, self.entropy_loss_bound)
+        cov_chol = fit.size[:, None] * _as_cov_chol(exact_dot(old_chol, factor))
+        cov_chol = jnp.where(jnp.any(fit.weights > 0), cov_chol, policy.cov_chol)
+        return LinearGaussian(policy.coef + as_coefficients(fit.basis, change, fit.size), cov_chol)
 
-    return m_step
 
+def _bounded_change(
+    fit: Regression, old_chol: Float[Array, "d d"], samples: WeightedSamples, kl_bound: float
+) -> tuple[Float[Array, "q d"], Scalar]:
+    """Go from the old mean towards the likeliest one, as far as the bound allows.
 
-def _bounded_mean(
-    policy: LinearGaussian, likeliest: Array, samples: WeightedSamples, kl_bound: float
-) -> Float[Array, "p d"]:
-    """Go from the old coefficients towards the likeliest ones, as far as the bound allows."""
-    rows, basis = _uncorrelated(samples)
-    gram = exact_dot(rows.T, samples.weights[:, None] * rows)
-    mean_square, axes = jnp.linalg.eigh(gram)
+    Returns:
+        The change in the coordinates of the regression, and the normaliser of its residuals.
+    """
+    basis = _uncorrelated(fit, samples)
+    rows = jax.scipy.linalg.solve_triangular(basis.T, fit.rows.T, lower=True).T
+    mean_square, axes = jnp.linalg.eigh(exact_dot(rows.T, rows))
     mean_square = jnp.maximum(mean_square, 0.0)
     # The whole way: in units of the old covariance, for features along the axes.
-    change = (likeliest - policy.coef).T
-    change = jax.scipy.linalg.solve_triangular(policy.cov_chol, change, lower=True).T
+    change = fit.solution.at[0].add(fit.centre)
+    change = jax.scipy.linalg.solve_triangular(old_chol, change.T, lower=True).T
     way = exact_dot(axes.T, exact_dot(basis, change))
     squares = 0.5 * jnp.sum(way**2, axis=1)
 
@@ -133,41 +158,35 @@ def _bounded_mean(
     def kl(multiplier: Array) -> Array:
         return jnp.sum(share(multiplier) ** 2 * squares)
 
-    moved = exact_dot(axes, share(_least_multiplier(kl, kl_bound, policy.coef.dtype))[:, None] * way)
-    moved = jax.scipy.linalg.solve_triangular(basis, moved)
-    return policy.coef + exact_dot(moved, policy.cov_chol.T)
+    multiplier = _least_multiplier(kl, kl_bound, way.dtype)
+    shares = share(multiplier)
+    moved = exact_dot(axes, shares[:, None] * way)
+    moved = exact_dot(jax.scipy.linalg.solve_triangular(basis, moved), old_chol.T)
+    # A share s of a fitted feature uses 2 s - s^2 of the scatter that the whole of it does.
+    counted = exact_dot(fit.weights, exact_dot(rows, axes) ** 2)
+    used = jnp.sum((2.0 - shares) * counted / (mean_square + multiplier))
+    return moved, normaliser(used, rows.shape[1])
 
 
-def _uncorrelated(samples: WeightedSamples) -> tuple[Array, Array]:
-    """Return features (n, p) whose mean square over the contexts that count is I, and their basis (p, p).
+def _uncorrelated(fit: Regression, samples: WeightedSamples) -> Float[Array, "q q"]:
+    """Return the upper triangular matrix for which coordinates are it times features of mean square I.
 
-    The features are these rows times the basis, which is upper triangular.
+    The mean is that over the contexts that count.
     """
     counts = samples.is_valid & jnp.all(jnp.isfinite(samples.features), axis=1)
-    features = jnp.where(counts[:, None], samples.features, 0.0)
-    features = features / jnp.sqrt(jnp.maximum(jnp.sum(counts, dtype=features.dtype), 1.0))
-    size = jnp.linalg.norm(features, axis=0)
-    size = jnp.asarray(jnp.where(size > 0, size, 1.0))
-    floor = _LEAST_EXCITATION * jnp.eye(features.shape[1], dtype=features.dtype)
-    basis = jnp.linalg.qr(jnp.concatenate([features / size[None, :], floor]), mode="r") * size[None, :]
-    rows = jnp.where(counts[:, None], samples.features, 0.0)
-    return jax.scipy.linalg.solve_triangular(basis.T, rows.T, lower=True).T, basis
+    rows = coordinates(fit.basis, jnp.where(counts[:, None], samples.features, 0.0))
+    num = jnp.maximum(jnp.sum(counts, dtype=rows.dtype), 1.0)
+    rows = jnp.where(counts[:, None], rows, 0.0) / jnp.sqrt(num)
+    size = jnp.linalg.norm(rows, axis=0)
+    floor = _LEAST_EXCITATION * jnp.diag(jnp.asarray(jnp.where(size > 0, size, 1.0)))
+    floor = floor + jnp.pad(gauge(fit.basis), ((1, 0), (1, 0)))
+    return jnp.linalg.qr(jnp.concatenate([rows, floor]), mode="r")
 
 
-def _bounded_cov_chol(
-    policy: LinearGaussian,
-    coef: Array,
-    samples: WeightedSamples,
-    kl_bound: float,
-    entropy_loss_bound: float | None,
+def _bounded_factor(
+    scatter: Float[Array, "d d"], kl_bound: float, entropy_loss_bound: float | None
 ) -> Float[Array, "d d"]:
-    """Go from the old covariance towards the weighted one about the new mean, as far as the bounds allow."""
-    features, theta, weights, _ = samples
-    counts = (weights > 0)[:, None]
-    features, theta = (jnp.where(counts, x, 0.0) for x in (features, theta))
-    residual = theta - exact_dot(features, coef)
-    residual = jax.scipy.linalg.solve_triangular(policy.cov_chol, residual.T, lower=True).T
-    scatter = exact_dot(residual.T, weights[:, None] * residual) / unbiased_normaliser(weights)  # Eq. (15)
+    """Go from a covariance I towards a weighted one, as far as the bounds allow; return a root of it."""
     spread, axes = jnp.linalg.eigh(0.5 * (scatter + scatter.T))
     excess = jnp.maximum(spread, 0.0) - 1.0
 
@@ -193,13 +212,16 @@ def _bounded_cov_chol(
     if entropy_loss_bound is not None:
         entropy_multiplier = _least_multiplier(entropy_loss, entropy_loss_bound, excess.dtype)
     x = 1.0 + change_within_kl(entropy_multiplier)
-    root = exact_dot(policy.cov_chol, axes * jnp.sqrt(x)[None, :])
+    return axes * jnp.sqrt(x)[None, :]
+
+
+def _as_cov_chol(root: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """Return the Cholesky factor of a covariance whose root is given, for parameters of size one."""
     upper = jnp.linalg.qr(root.T, mode="r")
     cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
     # Below the rounding of theta a spread means nothing, and would shrink to zero.
-    least = 4.0 * jnp.finfo(theta.dtype).eps * jnp.max(jnp.abs(theta), axis=0)
-    cov_chol = cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]
-    return jnp.where(jnp.any(counts), cov_chol, policy.cov_chol)
+    least = 4.0 * jnp.finfo(cov_chol.dtype).eps
+    return cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]
 
 
 def _least_multiplier(move: Callable[[Array], Scalar], bound: float, dtype: jnp.dtype) -> Array:

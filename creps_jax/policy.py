@@ -9,14 +9,13 @@ import jax
 import jax.numpy as jnp
 
 from creps_jax import checks
-from creps_jax.linalg import exact_dot, safe_cholesky, unbiased_normaliser, weighted_ridge
+from creps_jax.linalg import exact_dot, safe_cholesky, safe_sqrt
+from creps_jax.regression import Regression, as_coefficients, regress
 from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike
 
 __all__ = ["LinearGaussian", "entropy", "fit_weighted_ml", "kl", "log_prob", "mean", "sample"]
 
 _LOG_TWO_PI = 1.8378770664093453
-_ROUNDING = 3e-6
-"""Spread of a feature, as a share of its size, that may be rounding."""
 
 
 class LinearGaussian(NamedTuple):
@@ -129,7 +128,7 @@ def fit_weighted_ml(
 ) -> LinearGaussian:
     """Fit the policy to weighted samples by maximum likelihood.
 
-    Parameters may have very different units: each is fitted on its own scale. The ridge shrinks the policy
+    The fit does not depend on the units and zeros of parameters and features. The ridge shrinks the policy
     towards the weighted mean of theta (as far as the features can express a constant), not towards zero: it
     penalises how the mean changes with the context, from whatever zero the context is measured.
 
@@ -144,68 +143,31 @@ def fit_weighted_ml(
             constant takes away in each of many updates adds up. By default that constant.
 
     Returns:
-        The policy. Its covariance is taken about its own, context-dependent mean; it is finite and positive
-        definite for any weights: what too few samples leave open is filled in as small as rounding allows.
+        The policy. Its covariance is taken about its own, context-dependent mean, and unbiased however many
+        features the mean has. It is finite and positive definite for any weights: what too few samples leave
+        open is filled in as small as rounding allows.
 
     Raises:
         ValueError: If shapes do not fit each other, or a number is out of its range.
 
     Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
     """
-    checks.finite("weights", weights, least=0.0)
-    checks.number("ridge", ridge, least=0.0)
-    if scale is not None:
-        checks.finite("scale", scale, above=0.0, largest=checks.LARGEST)
-    if start is not None:
-        checks.finite("start", start, largest=checks.LARGEST)
-    is_weighted = weights > 0
-    features = jnp.where(is_weighted[:, None], features, 0.0)
-    theta = jnp.where(is_weighted[:, None], theta, 0.0)
-    checks.finite("features", features, largest=checks.LARGEST)
-    checks.finite("theta", theta, largest=checks.LARGEST)
-    total = jnp.sum(weights)
-    weights = weights / jnp.where(total > 0, total, 1.0)
-
-    size = jnp.max(jnp.abs(theta), axis=0)
-    start = jnp.zeros((features.shape[1], theta.shape[1]), theta.dtype) if start is None else start
-    theta = theta - exact_dot(features, start)
-    centre = exact_dot(weights, theta)
-    ones = jnp.ones((theta.shape[0], 1), theta.dtype)
-    # The features' nearest to a constant. Of features that sum to one it is that sum, wherever samples are.
-    guess = jnp.ones((features.shape[1], 1), theta.dtype)
-    short = ones - exact_dot(features, guess)
-    constant = guess + weighted_ridge(features, short, weights, ridge=0.0, scale=scale)
-    rest = (theta - centre[None, :]) + (ones - exact_dot(features, constant)) * centre[None, :]
-    if scale is None:
-        scale = _spread(features, weights)
-    slope = weighted_ridge(features, rest, weights, ridge=ridge, scale=scale, free=constant[:, 0])  # Eq. (14)
-    residual = jnp.where(is_weighted[:, None], rest - exact_dot(features, slope), 0.0)
-    cov_chol = _weighted_cov_chol(residual, weights, size)
-    return LinearGaussian(start + constant * centre[None, :] + slope, cov_chol)
+    fit = regress(features, theta, weights, ridge=ridge, scale=scale, start=start)  # Eq. 14
+    coef = as_coefficients(fit.basis, fit.solution.at[0].add(fit.centre), fit.size)
+    coef = coef if start is None else start + coef
+    return LinearGaussian(coef, fit.size[:, None] * _weighted_cov_chol(fit))
 
 
-def _spread(features: Float[Array, "n p"], weights: Float[Array, " n"]) -> Float[Array, " p"]:
-    """Return the weighted standard deviation of features; of one that is constant, to rounding, its size."""
-    size = jnp.sqrt(exact_dot(weights, features**2))
-    centred = features - exact_dot(weights, features)[None, :]
-    spread = jnp.sqrt(exact_dot(weights, centred**2))
-    return jnp.where(spread > _ROUNDING * size, spread, size)
-
-
-def _weighted_cov_chol(
-    residual: Float[Array, "n d"], weights: Float[Array, " n"], size: Float[Array, " d"]
-) -> Float[Array, "d d"]:
-    """Return the Cholesky factor of the weighted covariance of residuals; weights sum to one.
+def _weighted_cov_chol(fit: Regression) -> Float[Array, "d d"]:
+    """Return the Cholesky factor of the weighted covariance of residuals, in units of the parameters.
 
     It is taken of the correlations: what has to be added to make these positive definite is then relative to
-    the spread of each parameter. A parameter without spread gets that of its rounding, from its `size`.
+    the spread of each parameter. A parameter without spread gets that of its rounding.
     """
-    eps = jnp.finfo(residual.dtype).eps
-    normaliser = unbiased_normaliser(weights)
-    spread = jnp.sqrt(exact_dot(weights, residual**2) / normaliser)
-    spread = jnp.maximum(spread, 4.0 * eps * jnp.where(size > 0, size, 1.0))
-    unit = residual / spread[None, :]
-    correlation = exact_dot(unit.T, weights[:, None] * unit) / normaliser  # Eq. (15)
+    residual = fit.rest - exact_dot(fit.rows, fit.solution)
+    scatter = exact_dot(residual.T, residual) / fit.normaliser  # Eq. 15
+    spread = jnp.maximum(safe_sqrt(jnp.diagonal(scatter)), 4.0 * jnp.finfo(residual.dtype).eps)
+    correlation = scatter / (spread[:, None] * spread[None, :])
     is_diagonal = jnp.eye(spread.size, dtype=bool)
     return spread[:, None] * safe_cholesky(jnp.where(is_diagonal, 1.0, correlation))
 

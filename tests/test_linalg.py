@@ -5,7 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.linalg import centre_columns, safe_cholesky, thomas_solve, weighted_ridge, whitening
+from creps_jax.linalg import (
+    centre_columns,
+    normalised,
+    safe_cholesky,
+    safe_norm,
+    safe_sqrt,
+    thomas_solve,
+    weighted_mean,
+    weighted_ridge,
+    whitening,
+)
 
 
 def tridiagonal(rng, size):
@@ -101,16 +111,6 @@ def test_weighted_ridge_ignores_samples_without_weight():
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
-def test_weighted_ridge_leaves_the_free_direction_unpenalised():
-    rng = np.random.default_rng(8)
-    features, targets = jnp.float32(rng.normal(size=(50, 3)) + 1.0), jnp.float32(rng.normal(size=(50, 2)))
-    free = jnp.array([1.0, -2.0, 0.5])
-    found = weighted_ridge(features, targets, jnp.ones(50), ridge=1e6, free=free)
-    along = np.asarray(features @ free)
-    best = along @ np.asarray(targets) / (along @ along)
-    np.testing.assert_allclose(found, np.outer(free, best), rtol=1e-3, atol=1e-4)
-
-
 def test_weighted_ridge_holds_a_feature_that_could_be_large_but_is_not():
     features = jnp.ones((50, 2)).at[:, 1].set(jnp.linspace(0.0, 1e-4, 50))
     targets = features[:, 1:] * 1e4
@@ -127,6 +127,38 @@ def test_weighted_ridge_on_fewer_samples_than_features_fits_them(num_weighted):
     found = weighted_ridge(features, targets, weights, ridge=0.0)
     assert np.all(np.isfinite(found))
     np.testing.assert_allclose((features @ found)[:num_weighted], targets[:num_weighted], atol=1e-3)
+
+
+# Weights, means and roots.
+
+
+@pytest.mark.parametrize("function", [normalised, jax.jit(normalised)], ids=["eager", "compiled"])
+@pytest.mark.parametrize("largest", [1.2e-37, 1e-30, 1.0, 1e30, 1e38, 3.4e38])
+def test_weights_of_any_size_are_normalised(function, largest):
+    weights = np.array([0.0, 1.0, 0.3, 0.5])
+    found = function(jnp.float32(largest * weights))
+    np.testing.assert_allclose(found, weights / weights.sum(), rtol=1e-6)
+
+
+def test_weights_of_zero_stay_zero():
+    np.testing.assert_array_equal(normalised(jnp.zeros(3)), np.zeros(3))
+    gradient = jax.jacobian(normalised)(jnp.zeros(3))
+    assert np.all(np.isfinite(gradient))
+
+
+def test_a_weighted_mean_is_one_rounding_off():
+    rng = np.random.default_rng(13)
+    rows = np.float32(1e6 + rng.normal(size=(20_000, 2)))
+    weights = normalised(jnp.float32(rng.exponential(size=20_000)))
+    expected = np.average(np.float64(rows), axis=0, weights=np.float64(weights))
+    assert np.all(np.abs(weighted_mean(jnp.asarray(rows), weights) - expected) <= np.spacing(np.float32(1e6)))
+
+
+def test_roots_and_norms_have_a_gradient_at_zero():
+    np.testing.assert_array_equal(safe_sqrt(jnp.array([4.0, 0.0, -1.0])), [2.0, 0.0, 0.0])
+    np.testing.assert_array_equal(jax.grad(lambda x: safe_sqrt(x).sum())(jnp.array([4.0, 0.0])), [0.25, 0.0])
+    np.testing.assert_array_equal(jax.grad(safe_norm)(jnp.zeros(3)), np.zeros(3))
+    assert safe_norm(jnp.array([3.0, 4.0])) == pytest.approx(5.0)
 
 
 # Cholesky.

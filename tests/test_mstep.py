@@ -38,6 +38,25 @@ def parts(new, old, samples):
     return mean, 0.5 * (np.trace(change) - len(change) - np.linalg.slogdet(change)[1])
 
 
+def bounded_mean(policy, samples, kl_bound):
+    """Return the coefficients within the bound, and Z of their residuals, by normal equations in float64."""
+    features, theta, d = (np.asarray(x, float) for x in samples[:3])
+    old, inverse = np.asarray(policy.coef, float), np.linalg.inv(np.asarray(policy.cov_chol, float))
+    d = d / d.sum()
+    gram, everywhere = features.T @ (d[:, None] * features), features.T @ features / len(features)
+
+    def operator(log_multiplier):
+        return np.linalg.solve(gram + np.exp(log_multiplier) * everywhere, features.T * d)
+
+    def kl(log_multiplier):
+        shift = features @ operator(log_multiplier) @ (theta - features @ old) @ inverse.T
+        return 0.5 * np.sum(shift**2) / len(features)
+
+    least = -30.0 if kl(-30.0) < kl_bound else optimize.brentq(lambda x: kl(x) - kl_bound, -30.0, 40.0)
+    left = np.eye(len(d)) - features @ operator(least)
+    return old + operator(least) @ (theta - features @ old), np.sum(d[:, None] * left**2)
+
+
 @pytest.mark.parametrize("bounds", [(1.0, 0.05), (0.1, 0.5), (1e-3, 1e-3)])
 @pytest.mark.parametrize("num", [8, 60, 2000], ids="{} samples".format)
 def test_active_bounds_are_met_to_a_percent(key, num, bounds):
@@ -58,8 +77,8 @@ def test_bounds_out_of_reach_change_nothing(key):
 
 @pytest.mark.parametrize("entropy_loss", [None, 0.01, 0.001])
 def test_nothing_likelier_is_within_the_bounds(key, entropy_loss):
-    policy, samples = make_problem(key, dim=2, greed=3.0)
-    bounds = 3.0, 0.1
+    policy, samples = make_problem(key, num=200, dim=2, greed=2.0)
+    bounds = 1.0, 0.1
     m_step = bounded_ml(mean_kl_bound=bounds[0], cov_kl_bound=bounds[1], entropy_loss_bound=entropy_loss)
     new = m_step(policy, samples, ridge=RIDGE)
     features, theta, weights = (np.asarray(x, float) for x in samples[:3])
@@ -78,9 +97,8 @@ def test_nothing_likelier_is_within_the_bounds(key, entropy_loss):
     best = optimize.minimize(mean_cost, start, method="SLSQP", constraints=limit, options={"maxiter": 500}).x
     np.testing.assert_allclose(np.ravel(new.coef), best, rtol=0.01, atol=0.01)
 
-    # Z of Eq. (15) makes the scatter unbiased.
     residual = theta - features @ np.asarray(new.coef, float)
-    scatter = (residual.T * weights) @ residual / (1.0 - np.sum(weights**2))
+    scatter = (residual.T * weights) @ residual / bounded_mean(policy, samples, bounds[0])[1]
 
     def factor(flat):
         return np.array([[np.exp(flat[0]), 0.0], [flat[1], np.exp(flat[2])]])
@@ -121,6 +139,82 @@ def test_an_active_bound_does_not_know_the_units_of_the_context(key, unit, zero)
     np.testing.assert_allclose(
         (np.float64(features) @ np.float64(other.coef) - means) / spread, 0.0, atol=0.03
     )
+
+
+@pytest.mark.parametrize("kl_bound", [1e-8, 0.02, 0.3, 1e4])
+def test_the_covariance_counts_the_features_as_far_as_the_mean_follows_them(key, kl_bound):
+    policy, samples = make_problem(key, num=12, dim=2, context_dim=2, greed=0.2)
+    m_step = bounded_ml(mean_kl_bound=kl_bound, cov_kl_bound=1e4)
+    new = jax.jit(m_step)(policy, samples, ridge=0.0)
+    coef, normaliser = bounded_mean(policy, samples, kl_bound)
+    features, theta, weights = (np.asarray(x, float) for x in samples[:3])
+    residual = theta - features @ coef
+    scatter = (residual.T * weights) @ residual / normaliser
+    np.testing.assert_allclose(new.coef, coef, rtol=0.01, atol=0.01)
+    np.testing.assert_allclose(new.cov_chol @ new.cov_chol.T, scatter, rtol=0.02, atol=1e-3)
+
+
+@pytest.mark.parametrize("kl_bound", [1e-8, 1e4], ids=["held", "free"])
+@pytest.mark.parametrize(("num", "degree", "spread"), [(8, 2, 0.0), (8, 2, 1.0), (30, 4, 1.0)])
+def test_the_covariance_is_unbiased_for_few_weighted_samples(num, degree, spread, kl_bound):
+    rng = np.random.default_rng(2)
+    features = jnp.float32(rng.uniform(1.0, 3.0, size=(num, 1)) ** np.arange(degree + 1))
+    weights = np.exp(spread * rng.normal(size=num))
+    policy = LinearGaussian(jnp.zeros((degree + 1, 1)), jnp.eye(1))
+    m_step = bounded_ml(mean_kl_bound=kl_bound, cov_kl_bound=1e4)
+
+    def variance(theta):
+        samples = WeightedSamples(features, theta, jnp.float32(weights / weights.sum()), jnp.ones(num, bool))
+        return m_step(policy, samples, ridge=0.0).cov_chol[0, 0] ** 2
+
+    variances = np.float64(jax.jit(jax.vmap(variance))(jnp.float32(rng.normal(size=(10_000, num, 1)))))
+    assert variances.mean() == pytest.approx(1.0, abs=5 * variances.std() / np.sqrt(len(variances)))
+
+
+def converted(policy, samples, m_step, unit, zero=0.0):
+    """Return what an M-step makes of features in other units: the mean at the samples, and the covariance.
+
+    Features are a constant and powers of the context, which counts from another zero.
+    """
+    unit = np.asarray(unit)
+    features = np.asarray(samples.features, float)
+    coef = np.asarray(policy.coef, float)
+    change = np.eye(len(unit))
+    change[0, 1] = zero
+    features = np.float64(np.float32(features @ change * unit))
+    other = policy._replace(coef=jnp.float32(np.linalg.solve(change, coef) / unit[:, None]))
+    new = m_step(other, samples._replace(features=jnp.float32(features)), ridge=1e-3)
+    return features @ np.asarray(new.coef, float), np.asarray(new.cov_chol)
+
+
+@pytest.mark.parametrize("mean_kl_bound", [0.3, 1e4])
+def test_the_unit_and_zero_of_a_feature_do_not_matter(key, mean_kl_bound):
+    policy, samples = make_problem(key, context_dim=2, greed=0.5)
+    m_step = jax.jit(bounded_ml(mean_kl_bound=mean_kl_bound))
+    mean, cov_chol = converted(policy, samples, m_step, np.ones(3))
+    spread = np.linalg.norm(cov_chol, axis=1)
+    for column in range(3):
+        for factor in (1e-25, 1e-15, 1e-3, 1e7, 1e15, 1e25):
+            unit = np.where(np.arange(3) == column, factor, 1.0)
+            found = converted(policy, samples, m_step, unit)
+            np.testing.assert_allclose((found[0] - mean) / spread, 0.0, atol=2e-3)
+            np.testing.assert_allclose((found[1] - cov_chol) / spread[:, None], 0.0, atol=1e-3)
+    for zero in (1e2, 1e4):
+        found = converted(policy, samples, m_step, np.ones(3), zero)
+        np.testing.assert_allclose((found[0] - mean) / spread, 0.0, atol=1e-4 * zero + 1e-3)
+        # The context itself is rounded.
+        np.testing.assert_allclose((found[1] - cov_chol) / spread[:, None], 0.0, atol=2e-6 * zero + 1e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e-15, 1e12])
+def test_the_unit_of_a_parameter_does_not_matter(key, unit):
+    policy, samples = make_problem(key)
+    new = bounded_ml()(policy, samples, ridge=1e-3)
+    units = np.array([unit, 1.0, 1.0, 1.0], np.float32)
+    other_policy = LinearGaussian(policy.coef * units[None, :], policy.cov_chol * units[:, None])
+    other = bounded_ml()(other_policy, samples._replace(theta=samples.theta * units[None, :]), ridge=1e-3)
+    np.testing.assert_allclose(other.coef / units[None, :], new.coef, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(other.cov_chol / units[:, None], new.cov_chol, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("distance", [1.0, 1e3])

@@ -32,13 +32,25 @@ def data(num=300, seed=0):
 
 
 def fit_in_float64(features, theta, weights):
-    """Return coefficients and covariance of Eq. 14 and 15, written down plainly."""
+    """Return coefficients and covariance of Eq. 14 and 15, written down plainly.
+
+    Z counts the fitted features; of a constant alone it is that of Eq. 15.
+    """
     features, theta, d = (np.asarray(array, np.float64) for array in (features, theta, weights))
+    d = d / d.sum()
     gram = features.T @ np.diag(d) @ features
     coef = np.linalg.solve(gram, features.T @ np.diag(d) @ theta)
     residual = theta - features @ coef
-    normaliser = (d.sum() ** 2 - (d**2).sum()) / d.sum()
-    return coef, residual.T @ np.diag(d) @ residual / normaliser
+    return coef, residual.T @ np.diag(d) @ residual / normaliser_of(features, d)
+
+
+def normaliser_of(features, weights):
+    """Return Z = 1 - sum d^2 x' G^-1 x with G = X' D X."""
+    features, d = np.asarray(features, np.float64), np.asarray(weights, np.float64)
+    d = d / d.sum()
+    return 1 - np.trace(
+        np.linalg.solve(features.T @ np.diag(d) @ features, features.T @ np.diag(d**2) @ features)
+    )
 
 
 # The distribution.
@@ -92,7 +104,8 @@ def test_gradient_of_the_weighted_log_likelihood_is_zero():
     share = weights / jnp.sum(weights)
     found = fit(features, theta, weights, ridge=0.0)
     # Eq. 15 divides by Z, which is unbiased; the likelihood is greatest with Z = 1.
-    likeliest = found._replace(cov_chol=found.cov_chol * jnp.sqrt(1 - jnp.sum(share**2)))
+    root = jnp.sqrt(jnp.float32(normaliser_of(features, weights)))
+    likeliest = found._replace(cov_chol=found.cov_chol * root)
 
     def likelihood(coef_change, root_change):
         spread = jnp.diagonal(likeliest.cov_chol)
@@ -117,22 +130,248 @@ def test_noise_is_recovered_though_the_context_moves_the_mean():
     np.testing.assert_allclose(found.cov_chol @ found.cov_chol.T, np.diag([0.01, 0.09]), atol=5e-3)
 
 
-def test_covariance_is_unbiased_for_few_weighted_samples():
-    # Without features but a constant, Z of Eq. 15 makes the covariance unbiased whatever the weights.
+@pytest.mark.parametrize(
+    ("num", "degree", "spread"), [(6, 0, 1.0), (8, 2, 0.0), (8, 2, 1.0), (5, 3, 0.3), (30, 4, 1.0)]
+)
+def test_covariance_is_unbiased_for_few_weighted_samples(num, degree, spread):
     rng = np.random.default_rng(2)
-    theta = jnp.float32(rng.normal(size=(4000, 6, 1)))
-    weights = jnp.array([4.0, 2.0, 1.0, 1.0, 0.5, 0.5])
-    fitted = jax.vmap(lambda t: fit(jnp.ones((6, 1)), t, weights, ridge=0.0))(theta)
-    assert np.mean(np.float64(fitted.cov_chol) ** 2) == pytest.approx(1.0, abs=0.06)
+    features = jnp.float32(rng.uniform(1.0, 3.0, size=(num, 1)) ** np.arange(degree + 1))
+    weights = jnp.float32(np.exp(spread * rng.normal(size=num)))
+    theta = 3.0 + jnp.float32(rng.normal(size=(20_000, num, 1)))
+    fitted = jax.jit(jax.vmap(lambda t: fit_weighted_ml(features, t, weights, ridge=0.0)))(theta)
+    variances = np.float64(fitted.cov_chol[:, 0, 0]) ** 2
+    assert variances.mean() == pytest.approx(1.0, abs=5 * variances.std() / np.sqrt(len(variances)))
 
 
-def test_fit_does_not_depend_on_the_units_of_parameters_weights_or_features():
-    features, theta, weights = data()
-    plain = fit(features, theta, weights, ridge=1e-3)
-    units = jnp.array([1e6, 1e-5])
-    scaled = fit(8.0 * features, theta * units[None, :], 1e3 * weights, ridge=1e-3)
-    np.testing.assert_allclose(8.0 * scaled.coef / units[None, :], plain.coef, rtol=1e-3)
-    np.testing.assert_allclose(scaled.cov_chol / units[:, None], plain.cov_chol, rtol=1e-2)
+def test_normaliser_of_a_constant_alone_is_that_of_equation_15():
+    rng = np.random.default_rng(2)
+    theta, weights = rng.normal(size=(6, 1)), np.array([4.0, 2.0, 1.0, 1.0, 0.5, 0.5])
+    found = fit(jnp.ones((6, 1)), jnp.float32(theta), jnp.float32(weights), ridge=0.0)
+    residual = theta[:, 0] - np.average(theta[:, 0], weights=weights)
+    normaliser = (weights.sum() ** 2 - (weights**2).sum()) / weights.sum()
+    assert found.cov_chol[0, 0] ** 2 == pytest.approx(np.sum(weights * residual**2) / normaliser, rel=1e-5)
+
+
+def test_a_mean_that_the_ridge_holds_counts_as_a_constant():
+    features, theta, weights = data(num=8)
+    theta = jnp.float32(np.random.default_rng(4).normal(size=(8, 1)))
+    held = fit(features, theta, weights, ridge=1e6)
+    constant = fit(jnp.ones((8, 1)), theta, weights, ridge=0.0)
+    np.testing.assert_allclose(held.cov_chol, constant.cov_chol, rtol=1e-3)
+
+
+# Units and zeros.
+
+
+def polynomial(num=100, degree=3):
+    """Return features 1, s, s^2, ..., parameters, weights and a start in float64."""
+    rng = np.random.default_rng(5)
+    context = rng.uniform(0.5, 1.5, size=num)
+    theta = np.column_stack([1 + 2 * context - context**2, 3 * context])
+    theta += rng.normal(size=(num, 2)) * [0.1, 0.2]
+    start = rng.normal(size=(degree + 1, 2))
+    return context[:, None] ** np.arange(degree + 1), theta, rng.exponential(size=num), start
+
+
+def fitted(features, theta, weights, start=None, scale=None, ridge=1e-3):
+    """Return the mean at the samples, in float64, and the factor of the covariance."""
+    arrays = [None if x is None else jnp.float32(x) for x in (features, theta, weights, scale, start)]
+    found = fit(*arrays[:3], ridge=ridge, scale=arrays[3], start=arrays[4])
+    return np.float64(np.float32(features)) @ np.float64(found.coef), np.float64(found.cov_chol)
+
+
+@pytest.mark.parametrize("has_scale", [False, True], ids=["no scale", "scale"])
+@pytest.mark.parametrize("has_start", [False, True], ids=["no start", "start"])
+def test_the_unit_of_a_feature_does_not_matter(has_start, has_scale):
+    features, theta, weights, start = polynomial()
+    start, scale = (start if has_start else None), (np.ones(4) if has_scale else None)
+    expected = fitted(features, theta, weights, start, scale)
+    for column in range(4):
+        for factor in (1e-30, 1e-25, 1e-15, 1e-3, 1e7, 1e15, 1e18, 1e28):
+            unit = np.where(np.arange(4) == column, factor, 1.0)
+            found = fitted(
+                unit * features,
+                theta,
+                weights,
+                None if start is None else start / unit[:, None],
+                None if scale is None else scale * unit,
+            )
+            np.testing.assert_allclose(found[0], expected[0], atol=1e-4, err_msg=f"{column} times {factor}")
+            np.testing.assert_allclose(found[1], expected[1], atol=1e-5, err_msg=f"{column} times {factor}")
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e3, 1e6, 2e7, 1e10])
+def test_the_unit_of_the_context_of_a_polynomial_does_not_matter(unit):
+    features, theta, weights, _ = polynomial(degree=2)
+    units = unit ** np.arange(3.0)
+    expected = fitted(features, theta, weights)
+    np.testing.assert_allclose(fitted(units * features, theta, weights)[0], expected[0], atol=1e-4)
+    exact = features @ np.array([[1.0, 3.0], [2.0, 0.0], [-1.0, 0.0]])
+    np.testing.assert_allclose(fitted(units * features, exact, weights, ridge=0.0)[0], exact, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("constant", "zero"),
+    [*(("one", zero) for zero in (1e2, 1e4, 1e5, 1e6)), *(("sum of two", zero) for zero in (1e2, 1e4, 1e5))],
+)
+def test_the_zero_of_a_feature_does_not_matter(constant, zero):
+    features, theta, weights, _ = polynomial()
+    kind = np.arange(len(features)) % 3 == 0
+    ones = np.ones((len(features), 1)) if constant == "one" else np.column_stack([kind, ~kind])
+    context = np.float64(np.float32(features[:, 1:2] + zero))
+    found = fitted(np.column_stack([ones, context]), theta, weights)
+    expected = fitted(np.column_stack([ones, context - zero]), theta, weights)
+    # Coefficients of this size cannot hold the mean better.
+    np.testing.assert_allclose(found[0], expected[0], atol=8 * zero * np.finfo(np.float32).eps)
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-4)
+
+
+@pytest.mark.parametrize("has_start", [False, True], ids=["no start", "start"])
+def test_the_unit_and_zero_of_a_parameter_do_not_matter(has_start):
+    features, theta, weights, start = polynomial()
+    start = start if has_start else np.zeros_like(start)
+    expected = fitted(features, theta, weights, start)
+    for unit in (1e-30, 1e-15, 1e12):
+        units = np.array([unit, 1.0])
+        found = fitted(features, theta * units, weights, start * units)
+        np.testing.assert_allclose(found[0] / units, expected[0], atol=1e-4)
+        np.testing.assert_allclose(found[1] / units[:, None], expected[1], atol=1e-5)
+    for zero in (1e2, 1e4, 1e5):
+        shifted = np.float64(np.float32(theta + zero))
+        from_zero = start + np.array([[zero], [0], [0], [0]])
+        found, expected = (
+            fitted(features, shifted, weights, from_zero),
+            fitted(features, shifted - zero, weights, start),
+        )
+        np.testing.assert_allclose(found[0] - zero, expected[0], atol=4 * zero * np.finfo(np.float32).eps)
+        np.testing.assert_allclose(found[1], expected[1], atol=0.01)
+
+
+@pytest.mark.parametrize("size", [1e-38, 1e-30, 1e30, 1e37])
+def test_coefficients_beyond_the_format_stay_finite(size):
+    features, theta, weights, _ = polynomial()
+    unit = np.array([1.0, 1.0, 1.0, min(size, 1e29)])
+    found = fit(jnp.float32(features * unit), jnp.float32(theta * 1e14), jnp.float32(weights), ridge=0.0)
+    assert np.all(np.isfinite(found.coef)) and np.all(np.isfinite(found.cov_chol))
+    scale = jnp.full(4, size, jnp.float32)
+    held = fit(jnp.float32(features), jnp.float32(theta), jnp.float32(weights), ridge=1e-3, scale=scale)
+    assert np.all(np.isfinite(held.coef)) and np.all(np.isfinite(held.cov_chol))
+
+
+@pytest.mark.parametrize("function", [fit_weighted_ml, fit], ids=["eager", "compiled"])
+@pytest.mark.parametrize("largest", [1.2e-37, 1e-30, 1e30, 1e38, 3.4e38])
+def test_the_size_of_the_weights_does_not_matter(function, largest):
+    features, theta, weights, _ = (jnp.float32(x) for x in polynomial())
+    share = weights / weights.max()
+    share = jnp.where(share > 0.1, share, 0.0)
+    expected = function(features, theta, share, ridge=1e-3)
+    found = function(features, theta, share * jnp.float32(largest), ridge=1e-3)
+    np.testing.assert_allclose(features @ found.coef, features @ expected.coef, atol=1e-4)
+    np.testing.assert_allclose(found.cov_chol, expected.cov_chol, atol=1e-5)
+
+
+def test_features_and_parameters_beyond_their_limits_are_named():
+    features, theta, weights, _ = (jnp.float32(x) for x in polynomial())
+    with pytest.raises(ValueError, match=r"theta must be at most 1e\+15 in size, got"):
+        fit_weighted_ml(features, theta.at[3].set(1e16), weights, ridge=0.0)
+    with pytest.raises(ValueError, match=r"features must be at most 1e\+30 in size, got"):
+        fit_weighted_ml(features.at[3].set(1e31), theta, weights, ridge=0.0)
+
+
+# Gradients.
+
+
+def total(features, theta, weights, ridge=1e-3, scale=None, start=None):
+    """Return a sum of all that a fit returns, each entry counted differently."""
+    found = fit_weighted_ml(features, theta, weights, ridge=ridge, scale=scale, start=start)
+    sums = [jnp.sum(x * jnp.cos(jnp.arange(x.size, dtype=x.dtype)).reshape(x.shape)) for x in found]
+    return sums[0] + sums[1]
+
+
+gradients_of = jax.jit(jax.grad(total, (0, 1, 2)))
+
+
+@pytest.mark.parametrize("has_scale", [False, True], ids=["no scale", "scale"])
+@pytest.mark.parametrize("kind", ["polynomial", "radial", "no constant"])
+def test_gradients_are_those_of_finite_differences(kind, has_scale):
+    features, theta, weights, start = polynomial(num=12, degree=2)
+    rng = np.random.default_rng(6)
+    if kind == "radial":
+        features = np.exp(-8 * (features[:, 1:2] - [0.5, 1.0, 1.5]) ** 2)
+        features /= features.sum(axis=1, keepdims=True)
+    if kind == "no constant":
+        features = rng.normal(size=(12, 3))
+    with jax.enable_x64(True):
+        arrays = [jnp.float64(x) for x in (features, theta, weights)]
+        settings = {
+            "ridge": 0.1,
+            "scale": jnp.ones(3, jnp.float64) if has_scale else None,
+            "start": jnp.float64(start),
+        }
+        function = jax.jit(lambda *xs: total(*xs, **settings))
+        gradients = jax.jit(jax.grad(function, (0, 1, 2)))(*arrays)
+        for position, gradient in enumerate(gradients):
+            # The constant stays one, and features that sum to one do so.
+            towards = rng.normal(size=gradient.shape)
+            if position == 0 and kind != "no constant":
+                towards[:, 0] = 0.0 if kind == "polynomial" else -towards[:, 1:].sum(axis=1)
+            ends = [
+                function(*(x + step * towards if i == position else x for i, x in enumerate(arrays)))
+                for step in (1e-6, -1e-6)
+            ]
+            slope = float(ends[0] - ends[1]) / 2e-6
+            assert np.sum(gradient * towards) == pytest.approx(slope, rel=1e-5)
+
+
+def degenerate(case):
+    """Return samples of a kind that a naive derivative of the fit divides by zero for."""
+    features, theta, weights, start = polynomial(num=12, degree=2)
+    if case == "some weights are zero":
+        weights[::3], features[::3], theta[::3] = 0.0, np.nan, np.nan
+    elif case == "all weights are zero":
+        weights[:] = 0.0
+    elif case == "one weight is not zero":
+        weights[1:] = 0.0
+    elif case == "no residuals":
+        theta = np.zeros_like(theta)
+    elif case == "residuals of rounding":
+        theta = features @ start
+    elif case == "parameters are equal":
+        theta[:, 1] = theta[:, 0]
+    elif case == "eigenvalues are equal":
+        features, theta = features[:, :1], np.resize(np.eye(4)[:, :2] - 0.25, (12, 2))
+        weights[:] = 1.0
+    elif case == "features are equal":
+        features[:, 2] = features[:, 1]
+    elif case == "features are zero":
+        features = np.zeros_like(features)
+    return [jnp.float32(x) for x in (features, theta, weights)]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "some weights are zero",
+        "all weights are zero",
+        "one weight is not zero",
+        "no residuals",
+        "residuals of rounding",
+        "parameters are equal",
+        "eigenvalues are equal",
+        "features are equal",
+        "features are zero",
+    ],
+)
+def test_gradients_are_finite_for(case):
+    features, theta, weights = degenerate(case)
+    for ridge in (0.0, 1e-3):
+        for gradient in gradients_of(features, theta, weights, ridge):
+            assert np.all(np.isfinite(gradient))
+            if case == "some weights are zero":
+                assert np.all(gradient[::3] == 0)
+
+
+# The ridge.
 
 
 def test_ridge_shrinks_towards_the_weighted_mean():
