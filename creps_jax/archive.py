@@ -25,8 +25,8 @@ class Archive(NamedTuple):
     """The last L samples, where `batch` has L slots.
 
     Attributes:
-        batch: The slots, in no particular order of age. Slots never written, and numbers of a sample that were
-            not finite, hold zeros.
+        batch: The slots, in no particular order of age. Slots never written, and numbers of a sample that
+            were not finite, hold zeros.
         next_index: The slot that the next sample goes to.
         size: How many slots have been written, at most L.
         age: How many batches were pushed after that of each slot.
@@ -161,4 +161,6 @@ def centred_reward(archive: Archive) -> tuple[Float[Array, " L"], Scalar]:
 
 def _is_finite(batch: Batch) -> Bool[Array, " n"]:
     context, theta, reward = batch
-    return jnp.isfinite(reward) & jnp.all(jnp.isfinite(context), axis=1) & jnp.all(jnp.isfinite(theta), axis=1)
+    return (
+        jnp.isfinite(reward) & jnp.all(jnp.isfinite(context), axis=1) & jnp.all(jnp.isfinite(theta), axis=1)
+    )

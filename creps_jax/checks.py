@@ -34,6 +34,7 @@ __all__ = [
     "finite",
     "function",
     "grid",
+    "host_array",
     "instance",
     "key",
     "number",
@@ -177,6 +178,28 @@ def ends(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
     if not np.all(width >= NARROWEST):
         raise ValueError(f"low must be below high by at least {NARROWEST:g}, got {low} and {high}")
     return low, high
+
+
+def host_array(
+    name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, note: str = ""
+) -> Array | np.ndarray:
+    """Return numbers as `array` does, but leave those that are not of jax with NumPy, in their precision.
+
+    Raises:
+        ValueError: As `array` does.
+    """
+    if isinstance(value, jax.Array):
+        return array(name, value, shape, note=note)
+    try:
+        values = np.asarray(value)
+    except (TypeError, ValueError):  # traced, or ragged
+        return array(name, value, shape, note=note)
+    if not _is_real(values):
+        return array(name, value, shape, note=note)
+    # Zeros have shape and type, and no NaN, which jax does not let pass where it looks out for them.
+    array(name, np.zeros(values.shape, values.dtype), shape, note=note)
+    is_wide_float = values.dtype.kind == "f" and values.dtype.itemsize >= 4
+    return values if is_wide_float else values.astype(np.float64)
 
 
 def array(name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, note: str = "") -> Array:

@@ -8,8 +8,9 @@ import dataclasses
 import functools
 import warnings
 import weakref
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,9 @@ from creps_jax.mstep import MStep, WeightedSamples, bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar, ScalarLike
 
-__all__ = ["Creps", "CrepsInfo", "CrepsState", "creps"]
+__all__ = ["Creps", "CrepsInfo", "CrepsSettings", "CrepsState", "creps"]
+
+A = TypeVar("A", Array, np.ndarray)
 
 _ENOUGH_SAMPLES = 3
 """Samples that the archive should hold for each feature and parameter: weights within the usual KL bound of
@@ -71,11 +74,11 @@ class CrepsInfo(NamedTuple):
     """How many archived samples the update was made from; those that are not finite are left out, and those
     of policies that the history no longer holds."""
     is_updated: Bool[Array, ""]
-    """False where the policy was kept, to the bit: there were too few samples to fit one, or the rewards do not
-    differ after the baseline."""
+    """False where the policy was kept, to the bit: there were too few samples to fit one, or the rewards do
+    not differ after the baseline."""
     p_value: Scalar
-    """How likely weights that have nothing to do with the parameters would depend on them as strongly as these
-    do; see `creps_jax.evidence`. The covariance moves only where this is below `significance`."""
+    """How likely weights that have nothing to do with the parameters would depend on them as strongly as
+    these do; see `creps_jax.evidence`. The covariance moves only where this is below `significance`."""
     unsupported_loss: Scalar
     """Entropy that this update took without evidence, in nats: the loss of entropy times the p-value. Its sum
     over a search warns of exploration that went without evidence: d parameters whose spread has fallen to
@@ -85,14 +88,67 @@ class CrepsInfo(NamedTuple):
     From about 0.1 on little can be learned: tell rewards in float64, or without their common offset."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class Creps:
-    """The algorithm: its settings as data, see `creps`, and four pure functions of them.
+    """The algorithm as a record of pure functions, closed over and never traced.
 
-    All functions may be jitted and vmapped; shapes are n samples, s context variables, d parameters. Algorithms
-    of equal settings share their compiled programs, whatever their KL bounds, and the last one frees them. An
-    algorithm whose features and M-step are data, as those of this library are, can be pickled.
+    All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters. What they
+    do in detail stands at the methods of `CrepsSettings`, which they are. Algorithms of equal settings share
+    their compiled programs, whatever their KL bounds, and the last one frees them. An algorithm whose features
+    and M-step are data, as those of this library are, can be pickled.
+
+    Attributes:
+        init: (policy) -> state, with an empty archive.
+        ask: (key, state, contexts (n, s)) -> thetas (n, d), drawn from the policy.
+        tell: (state, batch) -> (state, info): archive the batch, fit a new policy to the archive.
+        mean: (policy, contexts (n, s)) -> thetas (n, d), the policy without its exploration.
     """
+
+    init: Callable[[LinearGaussian], CrepsState]
+    ask: Callable[[PRNGKey, CrepsState, ArrayLike], Array]
+    tell: Callable[[CrepsState, Batch], tuple[CrepsState, CrepsInfo]]
+    mean: Callable[[LinearGaussian, ArrayLike], Array]
+
+    def __post_init__(self) -> None:
+        """Check the functions."""
+        for name, arguments in (
+            ("init", "(policy)"),
+            ("ask", "(key, state, contexts)"),
+            ("tell", "(state, batch)"),
+            ("mean", "(policy, contexts)"),
+        ):
+            checks.function(name, getattr(self, name), arguments)
+
+    @functools.cached_property
+    def settings(self) -> "CrepsSettings | None":
+        """The settings that all four functions are of; None where one of them is a user's own."""
+        owners = [getattr(function, "__self__", None) for function in self._functions]
+        is_one = all(owner is owners[0] for owner in owners)
+        return owners[0] if is_one and isinstance(owners[0], CrepsSettings) else None
+
+    @functools.cached_property
+    def programs(self) -> dict[Any, Any]:
+        """Compiled programs that are made of this algorithm, such as iterations."""
+        return {} if self.settings is None else self.settings.programs.others
+
+    def with_kl_bound(self, kl_bound: ScalarLike) -> "Creps":
+        """Return the algorithm with another KL bound, unless a function of it is a user's own."""
+        if self.settings is None:
+            return dataclasses.replace(self)
+        return dataclasses.replace(self.settings, kl_bound=kl_bound).algorithm()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the functions alone: programs are compiled anew where they are needed."""
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    @property
+    def _functions(self) -> tuple[Callable, ...]:
+        return self.init, self.ask, self.tell, self.mean
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class CrepsSettings:
+    """The settings of the algorithm as data, see `creps`, and the functions of `Creps` as methods."""
 
     policy_features: FeatureMap
     baseline_features: FeatureMap
@@ -102,6 +158,10 @@ class Creps:
     m_step: MStep
     importance: Importance | None
     significance: float | int | None
+
+    def algorithm(self) -> Creps:
+        """Return the functions."""
+        return Creps(self.init, self.ask, self.tell, self.mean)
 
     def init(self, policy: LinearGaussian) -> CrepsState:
         """Begin with a policy and an empty archive, both in the precision of the policy.
@@ -153,8 +213,8 @@ class Creps:
     def tell(self, state: CrepsState, batch: Batch) -> tuple[CrepsState, CrepsInfo]:
         """Archive a batch, and fit a new policy to the archive.
 
-        A sample that holds NaN or infinity, such as a measurement that failed, or whose features do, takes its
-        place in the archive and is then ignored. The policy is kept until the archive holds as many valid
+        A sample that holds NaN or infinity, such as a measurement that failed, or whose features do, takes
+        its place in the archive and is then ignored. The policy is kept until the archive holds as many valid
         samples as the policy has features and parameters, p + d: fewer leave the covariance singular. It is
         also kept where rewards do not differ after the baseline. Only a small program, which puts the batch
         into the archive, is compiled anew for batches of another size.
@@ -251,14 +311,16 @@ class Creps:
         expected = 0 if self.importance is None else self.importance.num_policies
         got = 0 if state.history is None else state.history.coef.shape[0]
         if got != expected:
-            raise ValueError(f"the state must hold the last {expected} policies, as `init` makes it, got {got}")
+            raise ValueError(
+                f"the state must hold the last {expected} policies, as `init` makes it, got {got}"
+            )
         return state._replace(policy=policy)
 
 
 class Programs:
     """Compiled programs of one algorithm; `others` holds those that are made of it, such as iterations."""
 
-    def __init__(self, settings: Creps):
+    def __init__(self, settings: CrepsSettings):
         """Compile nothing yet."""
         self.ask = jax.jit(partial(_ask, settings))
         self.push = jax.jit(push)
@@ -288,8 +350,8 @@ def creps(
     Args:
         policy_features: Features varphi(s) that the policy's mean is linear in.
         baseline_features: Features phi(s) whose expectations over the contexts are kept.
-        kl_bound: Largest relative entropy epsilon of one update, in nats. Nothing is compiled anew for another
-            one; where it is traced and not above zero, the policy is kept.
+        kl_bound: Largest relative entropy epsilon of one update, in nats. Nothing is compiled anew for
+            another one; where it is traced and not above zero, the policy is kept.
         archive_size: Number L of the last samples that are learned from. At least three for each feature and
             parameter; fewer are warned of.
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale.
@@ -317,7 +379,7 @@ def creps(
         raise ValueError(
             "m_step must be an M-step, such as bounded_ml(), got bounded_ml without its parentheses"
         )
-    return Creps(
+    settings = CrepsSettings(
         policy_features=policy_features,
         baseline_features=baseline_features,
         # Of one type, whatever kind of number it was: another type would be compiled for anew.
@@ -328,10 +390,11 @@ def creps(
         importance=importance,
         significance=significance,
     )
+    return settings.algorithm()
 
 
 def _ask(
-    settings: Creps, key: PRNGKey, policy: LinearGaussian, contexts: Array
+    settings: CrepsSettings, key: PRNGKey, policy: LinearGaussian, contexts: Array
 ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
     """Draw parameters, and tell where features are finite."""
     keys = jax.random.split(key, contexts.shape[0])
@@ -340,7 +403,7 @@ def _ask(
 
 
 def _mean(
-    settings: Creps, policy: LinearGaussian, contexts: Array
+    settings: CrepsSettings, policy: LinearGaussian, contexts: Array
 ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
     features = _features_of("policy_features", settings.policy_features, contexts)
     return jax.vmap(gaussian.mean, (None, 0))(policy, features), _are_finite(features)
@@ -356,7 +419,7 @@ class _Samples(NamedTuple):
     prior: Array
 
 
-def _update(settings: Creps, kl_bound: ScalarLike, state: CrepsState) -> tuple[CrepsState, CrepsInfo]:
+def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) -> tuple[CrepsState, CrepsInfo]:
     """Fit a new policy to the archive."""
     samples, history = _samples(settings, state)
     (features, theta, _, is_valid), prior = samples.weighted, samples.prior
@@ -397,7 +460,7 @@ def _update(settings: Creps, kl_bound: ScalarLike, state: CrepsState) -> tuple[C
     return CrepsState(policy, state.archive, state.iteration + 1, history), info
 
 
-def _samples(settings: Creps, state: CrepsState) -> tuple[_Samples, PolicyHistory | None]:
+def _samples(settings: CrepsSettings, state: CrepsState) -> tuple[_Samples, PolicyHistory | None]:
     """Return what an update is made from, and the history with the policy of this iteration."""
     archive = state.archive
     context, theta, _ = archive.batch
@@ -463,13 +526,16 @@ def _are_finite(rows: Array) -> Bool[Array, " n"]:
     return jnp.all(jnp.isfinite(rows), axis=1)
 
 
-def _converted(values: Array, dtype: jnp.dtype) -> Array:
+def _converted(values: A, dtype: jnp.dtype) -> A:
     """Convert an array; what has that type is returned as it is, as even an idle conversion takes time."""
-    return values if values.dtype == dtype and not values.weak_type else values.astype(dtype)
+    if values.dtype == dtype and not getattr(values, "weak_type", False):
+        return values
+    with np.errstate(over="ignore"):  # What is too large for the format becomes infinite: not valid.
+        return values.astype(dtype)
 
 
 def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> LinearGaussian:
-    """Return a policy in one precision after checking that it fits the features, and what is not traced of it."""
+    """Return a policy in one precision, after checking that it fits the features."""
     checks.instance(name, policy, LinearGaussian)
     coef, cov_chol = (
         checks.array(f"{name}.coef", policy.coef),
@@ -498,28 +564,18 @@ def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> 
     return policy
 
 
-def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | None]:
+def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.ndarray | None]:
     """Return a batch in the precision of the archive, and the rest of more precise rewards."""
     checks.instance("batch", batch, Batch)
-    reward = _given_reward(batch.reward)
+    reward = checks.host_array("batch.reward", batch.reward, ("n",))
     dtype = archive.batch.theta.dtype
     num, context_dim = reward.shape[0], archive.batch.context.shape[1]
     theta_dim, note = archive.batch.theta.shape[1], f" beside batch.reward {reward.shape}"
-    context = checks.array("batch.context", batch.context, (num, context_dim), note=note)
-    theta = checks.array("batch.theta", batch.theta, (num, theta_dim), note=note)
+    context = checks.host_array("batch.context", batch.context, (num, context_dim), note=note)
+    theta = checks.host_array("batch.theta", batch.theta, (num, theta_dim), note=note)
     _warn_of_coarse_rewards(reward)
     reward, rest = split_reward(reward, dtype)
-    batch = Batch(_converted(context, dtype), _converted(theta, dtype), jnp.asarray(reward))
-    return batch, None if rest is None else jnp.asarray(rest)
-
-
-def _given_reward(reward: ArrayLike) -> Array | np.ndarray:
-    """Return rewards (n,) in the precision in which they were given: jax would narrow those of NumPy."""
-    checked = checks.array("batch.reward", reward, ("n",))
-    if isinstance(reward, jax.Array):
-        return checked
-    values = np.asarray(reward)
-    return np.asarray(checked) if values.dtype == np.float32 else values.astype(np.float64)
+    return Batch(_converted(context, dtype), _converted(theta, dtype), reward), rest
 
 
 def _warn_of_coarse_rewards(reward: Array | np.ndarray) -> None:
@@ -532,10 +588,10 @@ def _warn_of_coarse_rewards(reward: Array | np.ndarray) -> None:
         return
     with np.errstate(over="ignore"):
         step, spread = np.spacing(np.abs(values).max()), values.max() - values.min()
-    if 0 < spread and _COARSE_REWARDS * spread < step:
+    if spread > 0 and _COARSE_REWARDS * spread < step:
         warnings.warn(
-            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where {values.dtype} has steps of "
-            f"{step:.3g}: tell rewards in float64, or without their common offset",
+            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where {values.dtype} has steps "
+            f"of {step:.3g}: tell rewards in float64, or without their common offset",
             stacklevel=4,
         )
 

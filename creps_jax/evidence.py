@@ -29,8 +29,8 @@ def independence_p_value(
 ) -> Scalar:
     """Test whether the weights of samples are independent of their parameters, given the context.
 
-    Three F-tests, of which the most significant counts, times three (Bonferroni): the change of the weights is
-    regressed on the parameters, on their squares, and on the sum of their squares. Parameters are whitened
+    Three F-tests, of which the most significant counts, times three (Bonferroni): the change of the weights
+    is regressed on the parameters, on their squares, and on the sum of their squares. Parameters are whitened
     after a regression on the features of the context.
 
     Args:
@@ -69,7 +69,7 @@ def independence_p_value(
 
 
 def share_of_evidence(p_value: ScalarLike, significance: float) -> Scalar:
-    """Return how far the evidence lets the covariance move: 1 for a p-value of 0, 0 from `significance` on."""
+    """Return how far the evidence lets the covariance move: 1 for a p-value of 0, 0 from `significance`."""
     return jnp.clip(1.0 - p_value / significance, 0.0, 1.0)
 
 
@@ -89,7 +89,8 @@ def blended_cov_chol(
 
 def _whitened_noise(prior: Array, features: Array, theta: Array) -> tuple[Array, Scalar, Scalar]:
     """Return what a regression on the features leaves of the parameters, whitened, and two numbers: of
-    independent features, a constant included, and of independent directions of the parameters."""
+    independent features, a constant included, and of independent directions of the parameters.
+    """
     white_features, num_features = _whitened(features, prior)
     centred = centre_columns(theta, prior)
     explained = exact_dot(white_features, exact_dot(white_features.T, prior[:, None] * centred))
@@ -99,7 +100,8 @@ def _whitened_noise(prior: Array, features: Array, theta: Array) -> tuple[Array,
 
 def _whitened(columns: Array, prior: Array) -> tuple[Array, Scalar]:
     """Return uncorrelated columns of mean zero and mean square one, zeros in place of those that depend on
-    others, and how many there are."""
+    others, and how many there are.
+    """
     centred = centre_columns(columns, prior)
     matrix = whitening(centred, prior, least_spread=_LEAST_SPREAD)
     return exact_dot(centred, matrix), jnp.sum(jnp.any(matrix != 0, axis=0), dtype=prior.dtype)
@@ -135,8 +137,8 @@ def _regression_p_value(
 def _f_survival(r_squared: Array, num_regressors: Array, rest: Array) -> Scalar:
     """Return the probability of a share of explained variance above `r_squared`, by chance.
 
-    Source: Paulson 1942, An approximate normalization of the analysis of variance distribution. The incomplete
-    beta function would be exact, and compile for seconds.
+    Source: Paulson 1942, An approximate normalization of the analysis of variance distribution. The
+    incomplete beta function would be exact, and compile for seconds.
     """
     left = jnp.maximum(1.0 - r_squared, jnp.finfo(r_squared.dtype).eps)
     root = jnp.cbrt(r_squared / num_regressors / (left / rest))

@@ -104,7 +104,7 @@ def bounded_ml(
 
 @dataclasses.dataclass(frozen=True)
 class BoundedML:
-    """The M-step of `bounded_ml`: its bounds as data, so that equal ones share programs and can be pickled."""
+    """The M-step of `bounded_ml`: its bounds as data, which can be compared and pickled."""
 
     mean_kl_bound: float
     cov_kl_bound: float

@@ -93,7 +93,7 @@ def make_iteration(
     @checks.arguments
     def iteration(key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
         key, state = replicate((key, _checked_state("state", state)), setup.devices)
-        return iterate(algorithm.kl_bound, key, state)
+        return iterate(key, state)
 
     return iteration
 
@@ -250,20 +250,21 @@ Iterate = Callable[[_Setup, Creps, PRNGKey, CrepsState], tuple[CrepsState, Itera
 
 
 def _program(algorithm: Creps, function: Callable, *static: Any) -> Callable:
-    """Return `function(*static, algorithm, key, state)`, compiled as (KL bound, key, state) -> results.
+    """Return `function(*static, algorithm, key, state)`, compiled as (key, state) -> results.
 
     Programs live as long as the algorithms of the same settings, which share them whatever their KL bounds.
     """
-    programs = algorithm.programs.others
+    programs = algorithm.programs
     if (function, *static) not in programs:
         # A copy: the program must not keep alive the algorithm that keeps it.
-        settings = dataclasses.replace(algorithm, kl_bound=np.float32(0))
+        copy = algorithm.with_kl_bound(np.float32(0))
 
         def program(kl_bound: ScalarLike, key: Array, state: CrepsState) -> Any:
-            return function(*static, dataclasses.replace(settings, kl_bound=kl_bound), key, state)
+            return function(*static, copy.with_kl_bound(kl_bound), key, state)
 
         programs[(function, *static)] = jax.jit(program)
-    return programs[(function, *static)]
+    kl_bound = np.float32(0) if algorithm.settings is None else algorithm.settings.kl_bound
+    return partial(programs[(function, *static)], kl_bound)
 
 
 def _iterate(
@@ -351,12 +352,12 @@ def _run(
     for setup, length in phases:
         if on_iteration is None and length > 1:
             scan = _program(algorithm, _scan, iterate, setup, length)
-            state, log = scan(algorithm.kl_bound, key, state)
+            state, log = scan(key, state)
             logs.append(jax.device_get(log))
             continue
         program = _program(algorithm, iterate, setup)
         for _ in range(length):
-            state, log = program(algorithm.kl_bound, key, state)
+            state, log = program(key, state)
             logs.append(jax.tree.map(lambda x: x[None], jax.device_get(log._replace(samples=None))))
             if on_iteration is not None:
                 on_iteration(state, log)

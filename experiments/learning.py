@@ -131,7 +131,8 @@ def learn(
     earlier = latest.log["mean_reward"].mean(axis=1) if latest.log else np.zeros(0)
     done = len(earlier)
     if done < plan.iterations:
-        with _Reporter(name, plan, earlier=earlier, console=session.console) as report, keeper:
+        lost = latest.log["info.unsupported_loss"].mean(axis=1).sum() if latest.log else 0.0
+        with _Reporter(name, plan, earlier=earlier, lost=lost, console=session.console) as report, keeper:
 
             def on_iteration(state: CrepsState, log: Any) -> None:
                 keeper.take(state, log)
@@ -184,8 +185,8 @@ class _Keeper:
 class _Reporter:
     """Turn the logs of iterations into rows of progress."""
 
-    def __init__(self, name: str, plan: Plan, *, earlier: np.ndarray, console: Console | None):
-        self._plan, self._done = plan, len(earlier)
+    def __init__(self, name: str, plan: Plan, *, earlier: np.ndarray, lost: float, console: Console | None):
+        self._plan, self._done, self._lost = plan, len(earlier), lost
         self._progress = None
         if console is not None:
             self._progress = Progress(
@@ -207,6 +208,7 @@ class _Reporter:
 
     def _report(self, log: Any) -> None:
         self._done += 1
+        self._lost += float(np.mean(log.info.unsupported_loss))
         if self._progress is None:
             return
         trials = len(log.mean_reward)
@@ -219,6 +221,8 @@ class _Reporter:
             mean_reward=float(np.mean(log.mean_reward)),
             fall_share=None if fell is None else float(np.mean(fell)),
             kl=float(np.mean(log.info.kl)),
+            p_value=float(np.median(log.info.p_value)),
+            unsupported_loss=self._lost,
             simulated_seconds=None if seconds is None else float(np.mean(seconds)) * new,
             samples=pooled(log.samples),
         )

@@ -22,6 +22,7 @@ TRACES = {
     "policy_kl": ("KL of the policy (nats)", True),
     "entropy": ("entropy of the policy (nats)", False),
     "effective_samples": ("effective samples", True),
+    "p_value": ("p-value of the evidence", True),
 }
 """What updates are watched by, fields of `CrepsInfo`: heading, and whether the axis is logarithmic."""
 

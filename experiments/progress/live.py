@@ -24,6 +24,8 @@ class Row(NamedTuple):
         mean_reward: mean over the iteration's samples.
         fall_share: share of the iteration's rollouts that fell; None where nothing can fall.
         kl: KL divergence of the sample weights.
+        p_value: of the test on evidence, see `CrepsInfo`; the median of the trials.
+        unsupported_loss: entropy that went without evidence so far, in nats; the mean of the trials.
         simulated_seconds: simulated time of the iteration; None where nothing is simulated.
         samples: the iteration's samples; None where they are not known.
     """
@@ -33,6 +35,8 @@ class Row(NamedTuple):
     mean_reward: float
     fall_share: float | None = None
     kl: float | None = None
+    p_value: float | None = None
+    unsupported_loss: float | None = None
     simulated_seconds: float | None = None
     samples: PooledSamples | None = None
 
@@ -125,6 +129,10 @@ class Progress:
             cells.append(("falls", f"{100 * row.fall_share:.0f}%"))
         if row.kl is not None:
             cells.append(("KL", f"{row.kl:.3f}"))
+        if row.p_value is not None:
+            cells.append(("p", f"{row.p_value:.2g}"))
+        if row.unsupported_loss is not None:
+            cells.append(("entropy lost by chance", f"{row.unsupported_loss:.2f} nats"))
         if row.simulated_seconds is not None and self._iteration_seconds > 0:
             speed = row.simulated_seconds / self._iteration_seconds
             cells.append(("simulation", f"{speed:,.0f} x real time"))

@@ -45,7 +45,13 @@ class Update(NamedTuple):
     num_valid: int
     """Trials that it was learned from."""
     is_updated: bool
-    """False where the policy was kept, as there were too few valid trials."""
+    """False where the policy was kept: there were too few valid trials, or rewards did not differ."""
+    is_informative: bool
+    """Whether rewards differ by more than the context explains."""
+    p_value: float
+    """How likely chance alone would relate rewards to parameters as strongly, see `CrepsInfo`."""
+    unsupported_loss: float
+    """Entropy that this update took by chance, in nats."""
 
 
 class Learner:
@@ -82,6 +88,9 @@ class Learner:
                     effective_samples=float(info.effective_samples),
                     num_valid=int(info.num_valid),
                     is_updated=bool(info.is_updated),
+                    is_informative=bool(info.dual.is_informative),
+                    p_value=float(info.p_value),
+                    unsupported_loss=float(info.unsupported_loss),
                 )
             )
             self._batches.append(list(batch))
@@ -203,4 +212,5 @@ def _within(values: Sequence[float], variables: Sequence[Context]) -> list[float
 def _as_batch(trials: Sequence[Trial]) -> Batch:
     rewards = [math.nan if trial.reward is None else trial.reward for trial in trials]
     columns = [list(trial.context.values()) for trial in trials], [trial.theta for trial in trials], rewards
-    return Batch(*(jnp.asarray(np.array(column, np.float32)) for column in columns))
+    # In float64, so that rewards keep their differences beside an offset.
+    return Batch(*(np.array(column, np.float64) for column in columns))

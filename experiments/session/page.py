@@ -17,6 +17,9 @@ PAGE, FIGURE = "status.md", "status.png"
 _BEFORE, _NOW = plots.PAPER_COLOUR, plots.COLOURS[0]
 _MAX_COLUMNS = 5
 
+_MUCH_LOST = 0.5
+"""Entropy lost by chance, in nats, from which on the page warns of it."""
+
 
 def save_page(folder: Path, status: Status) -> None:
     """Write the page and its figure into the folder of the session, atomically."""
@@ -43,7 +46,14 @@ def summary(status: Status) -> list[str]:
     if kept:
         lines.append(
             f"{kept} {'batch' if kept == 1 else 'batches'} left the policy as it was: "
-            f"an update needs {status.least_trials} trials that are not broken"
+            f"an update needs {status.least_trials} trials that are not broken, whose rewards "
+            "differ by more than the context explains"
+        )
+    lost = sum(update.unsupported_loss for update in updates)
+    if lost > _MUCH_LOST:
+        lines.append(
+            f"exploration went without evidence: {lost:.2f} nats of entropy; more trials in a batch or a "
+            "larger archive_size help"
         )
     return lines
 
@@ -55,7 +65,7 @@ def table(status: Status) -> str:
         name: []
         for name in (
             "batch", "trials", "broken", "best", "mean", "KL (nats)", "from first (nats)", "entropy (nats)",
-            "learned from", "effective",
+            "learned from", "effective", "p (chance)",
         )
     }  # fmt: skip
     for number, first in enumerate(range(0, len(told), size)):
@@ -68,8 +78,9 @@ def table(status: Status) -> str:
             update = status.updates[number]
             row += [f"{update.kl:.3f}" if update.is_updated else "kept", f"{update.kl_from_first:.3f}"]
             row += [f"{update.entropy:.2f}", update.num_valid, f"{update.effective_samples:.1f}"]
+            row += [f"{update.p_value:.2g}"]
         else:
-            row += ["-"] * 5
+            row += ["-"] * 6
         for cells, cell in zip(columns.values(), row, strict=True):
             cells.append(cell)
     return to_markdown(columns)
