@@ -92,10 +92,10 @@ class CrepsInfo(NamedTuple):
 class Creps:
     """The algorithm as a record of pure functions, closed over and never traced.
 
-    All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters. What they
-    do in detail stands at the methods of `CrepsSettings`, which they are. Algorithms of equal settings share
-    their compiled programs, whatever their KL bounds, and the last one frees them. An algorithm whose features
-    and M-step are data, as those of this library are, can be pickled.
+    All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters. They are
+    the methods of `CrepsSettings`, which say more. Algorithms of equal settings share their compiled programs,
+    whatever their KL bounds, and the last one frees them. An algorithm whose features and M-step are data, as
+    those of this library are, can be pickled.
 
     Attributes:
         init: (policy) -> state, with an empty archive.
@@ -590,8 +590,8 @@ def _warn_of_coarse_rewards(reward: Array | np.ndarray) -> None:
         step, spread = np.spacing(np.abs(values).max()), values.max() - values.min()
     if spread > 0 and _COARSE_REWARDS * spread < step:
         warnings.warn(
-            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where {values.dtype} has steps "
-            f"of {step:.3g}: tell rewards in float64, or without their common offset",
+            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where {values.dtype} "
+            f"has steps of {step:.3g}: tell rewards in float64, or without their common offset",
             stacklevel=4,
         )
 

@@ -4,7 +4,6 @@ Every random number of a run follows from its key and the number of the iteratio
 loop and a resumed run draw the same ones. Rollouts are shared out over the devices.
 """
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
