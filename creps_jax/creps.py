@@ -10,7 +10,7 @@ import warnings
 import weakref
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,8 +32,6 @@ from creps_jax.policy import LinearGaussian
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar, ScalarLike
 
 __all__ = ["Creps", "CrepsInfo", "CrepsSettings", "CrepsState", "creps"]
-
-A = TypeVar("A", Array, np.ndarray)
 
 _ENOUGH_SAMPLES = 3
 """Samples that the archive should hold for each feature and parameter: weights within the usual KL bound of
@@ -93,7 +91,7 @@ class Creps:
     """The algorithm as a record of pure functions, closed over and never traced.
 
     All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters. They are
-    the methods of `CrepsSettings`, which say more. Algorithms of equal settings share their compiled programs,
+    the methods of `CrepsSettings`, which say more. Algorithms of equal settings share compiled programs,
     whatever their KL bounds, and the last one frees them. An algorithm whose features and M-step are data, as
     those of this library are, can be pickled.
 
@@ -526,7 +524,7 @@ def _are_finite(rows: Array) -> Bool[Array, " n"]:
     return jnp.all(jnp.isfinite(rows), axis=1)
 
 
-def _converted(values: A, dtype: jnp.dtype) -> A:
+def _converted(values: Any, dtype: jnp.dtype) -> Any:
     """Convert an array; what has that type is returned as it is, as even an idle conversion takes time."""
     if values.dtype == dtype and not getattr(values, "weak_type", False):
         return values
@@ -575,7 +573,8 @@ def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.nd
     theta = checks.host_array("batch.theta", batch.theta, (num, theta_dim), note=note)
     _warn_of_coarse_rewards(reward)
     reward, rest = split_reward(reward, dtype)
-    return Batch(_converted(context, dtype), _converted(theta, dtype), reward), rest
+    # NumPy goes to the compiled program as it is: jax would not let NaN pass where it looks out for it.
+    return Batch(*(_converted(each, dtype) for each in (context, theta, reward))), rest
 
 
 def _warn_of_coarse_rewards(reward: Array | np.ndarray) -> None:

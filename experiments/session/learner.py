@@ -211,6 +211,11 @@ def _within(values: Sequence[float], variables: Sequence[Context]) -> list[float
 
 def _as_batch(trials: Sequence[Trial]) -> Batch:
     rewards = [math.nan if trial.reward is None else trial.reward for trial in trials]
-    columns = [list(trial.context.values()) for trial in trials], [trial.theta for trial in trials], rewards
+    columns = (
+        [list(trial.context.values()) for trial in trials],
+        [trial.theta for trial in trials],
+        rewards,
+    )
     # In float64, so that rewards keep their differences beside an offset.
-    return Batch(*(np.array(column, np.float64) for column in columns))
+    wide: Any = [np.array(column, np.float64) for column in columns]
+    return Batch(*wide)

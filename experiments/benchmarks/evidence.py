@@ -1,0 +1,110 @@
+"""Measure what a search does without evidence, and with rare evidence.
+
+    python -m experiments.benchmarks.evidence [--trials 8] [--searches 40]
+
+Pure noise: rewards that have nothing to do with the parameters, 2 contexts, affine features. The spread of the
+policy should stay; it is printed as the logarithm of what is left of it, for several lengths of the archive, with
+and without the test on evidence. Sparse: a reward of 1 for hits, which the first policy has by chance in 0.4 % of
+its episodes, and 0 otherwise.
+"""
+
+from experiments.process import prepare
+
+prepare()
+
+import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+
+from creps_jax.contexts import context_grid, uniform_contexts  # noqa: E402
+from creps_jax.creps import Creps, creps  # noqa: E402
+from creps_jax.features import linear_features  # noqa: E402
+from creps_jax.mstep import bounded_ml, weighted_ml  # noqa: E402
+from creps_jax.policy import LinearGaussian  # noqa: E402
+from creps_jax.tasks import PlainOutcome, Task  # noqa: E402
+from creps_jax.train import train_trials  # noqa: E402
+from experiments import tables  # noqa: E402
+
+M_STEPS = {"weighted ML": weighted_ml, "bounded": bounded_ml()}
+NOISE = ((10, 20, 3_000, (60, 100, 200, 400)), (20, 50, 10_000, (200, 400)))
+"""Parameters, samples of an iteration, episodes, and lengths of the archive."""
+SIGNIFICANCES = {"default": 0.1, "no test": None}
+SPARSE_ARCHIVE, SPARSE_SAMPLES, SPARSE_EPISODES = 200, 20, 3_000
+HIT_RADIUS = 0.17
+
+
+def main(trials: int = 8, searches: int = 40) -> None:
+    """Measure, and print a table for each.
+
+    Args:
+        trials: Searches in pure noise, for each row.
+        searches: Searches for the sparse reward.
+    """
+    columns: dict[str, list[object]] = {"fit": [], "parameters": [], "archive": []}
+    columns |= {f"log spread, {name}": [] for name in SIGNIFICANCES}
+    for fit in M_STEPS:
+        for dim, samples, episodes, archives in NOISE:
+            for archive in archives:
+                columns["fit"].append(fit)
+                columns["parameters"].append(dim)
+                columns["archive"].append(archive)
+                for name, significance in SIGNIFICANCES.items():
+                    spread = log_spread(fit, dim, samples, episodes, archive, trials, significance)
+                    columns[f"log spread, {name}"].append(f"{spread.mean():.2f} ({spread.min():.2f})")
+    print("Pure noise: mean (least of the trials) over the parameters of log(spread after / before)")
+    print(tables.to_markdown(columns))
+    print(f"Sparse reward: share of {searches} searches that hit in at least 90 % of contexts")
+    print(
+        tables.to_markdown({"fit": list(M_STEPS), "solved": [f"{solved(f, searches):.0%}" for f in M_STEPS]})
+    )
+
+
+def log_spread(
+    fit: str, dim: int, samples: int, episodes: int, archive: int, trials: int, significance: float | None
+) -> np.ndarray:
+    """Return the logarithm of the geometric mean spread that noise leaves of one, for each trial."""
+
+    def rollout(key: jax.Array, context: jax.Array, theta: jax.Array) -> PlainOutcome:
+        return PlainOutcome(jax.random.normal(key), jnp.zeros(0))
+
+    features = linear_features(2)
+    algorithm = creps(
+        features, features, archive_size=archive, m_step=M_STEPS[fit], significance=significance
+    )
+    task = Task(uniform_contexts((0.0, 0.0), (1.0, 1.0)), rollout, 2, dim, worst_reward=-100.0)
+    cov_chol = _last_policies(algorithm, task, samples, episodes, trials).cov_chol
+    return np.log(np.diagonal(cov_chol, axis1=-2, axis2=-1)).mean(axis=-1)
+
+
+def solved(fit: str, searches: int) -> float:
+    """Return the share of searches that solve the sparse task."""
+
+    def is_hit(context: jax.Array, theta: jax.Array) -> jax.Array:
+        target = jnp.concatenate([1.2 + 0.3 * context, -0.8 + 0.3 * context])
+        return jnp.sum((theta - target) ** 2) < HIT_RADIUS**2
+
+    def rollout(key: jax.Array, context: jax.Array, theta: jax.Array) -> PlainOutcome:
+        return PlainOutcome(jnp.where(is_hit(context, theta), 1.0, 0.0), jnp.zeros(0))
+
+    features = linear_features(1)
+    algorithm = creps(features, features, archive_size=SPARSE_ARCHIVE, m_step=M_STEPS[fit])
+    task = Task(uniform_contexts(0.0, 1.0), rollout, 1, 2, worst_reward=-1.0)
+    policies = _last_policies(algorithm, task, SPARSE_SAMPLES, SPARSE_EPISODES, searches)
+    grid = context_grid(0.0, 1.0, 21)
+    thetas = jax.vmap(algorithm.mean, (0, None))(policies, grid)
+    hits = jax.vmap(jax.vmap(is_hit), (None, 0))(grid, thetas)
+    return float(np.mean(np.asarray(hits).mean(axis=1) >= 0.9))
+
+
+def _last_policies(algorithm: Creps, task: Task, samples: int, episodes: int, trials: int) -> LinearGaussian:
+    size = 1 + task.context_dim
+    start = LinearGaussian(jnp.zeros((size, task.theta_dim)), jnp.eye(task.theta_dim))
+    keys = jax.random.split(jax.random.key(0), trials)
+    settings = {"iterations": episodes // samples, "samples": samples, "devices": jax.devices()[:1]}
+    states, _ = train_trials(keys, task, algorithm, start, **settings)
+    return jax.tree.map(np.asarray, states.policy)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
