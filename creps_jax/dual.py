@@ -287,8 +287,7 @@ class _Guess(NamedTuple):
 def _first_guess(samples: _Standardised, kl_bound: Array) -> _Guess:
     """Return the solution for a small bound: a least-squares baseline, and the spread that it leaves."""
     coef = exact_dot(samples.whitening, exact_dot(samples.prior * samples.reward, samples.whitened))
-    residual = samples.reward - exact_dot(samples.centred, coef)
-    residual = residual - exact_dot(samples.prior, residual)
+    residual = _residual(samples, coef)
     # For a small bound the relative entropy is var(R - V) / (2 eta^2).
     temperature = jnp.sqrt(exact_dot(samples.prior, residual**2) / (2.0 * kl_bound))
     mean_size = -exact_dot(samples.prior, samples.reward)
@@ -307,15 +306,21 @@ def _first_guess(samples: _Standardised, kl_bound: Array) -> _Guess:
 def _is_informative(first: _Guess, samples: _Standardised, threshold: Array) -> Array:
     """Say whether a baseline, the best of all in the sense of least squares, leaves more than rounding."""
     # Unlike the first guess this fit leaves out no direction that the format can tell from rounding.
-    residual = samples.reward - exact_dot(samples.centred, first.baseline_coef)
-    residual = residual - exact_dot(samples.prior, residual)
+    residual = _residual(samples, first.baseline_coef)
     change = weighted_ridge(samples.centred, residual[:, None], samples.prior, ridge=0.0)[:, 0]
     coef = first.baseline_coef + change
-    residual = samples.reward - exact_dot(samples.centred, coef)
-    residual = jnp.where(samples.prior > 0, residual - exact_dot(samples.prior, residual), 0.0)
+    residual = _residual(samples, coef)
     sizes = exact_dot(jnp.abs(samples.centred), jnp.abs(coef))
     rounding = _eps(sizes) * (_ROUNDING + _FIT_ROUNDING * jnp.max(sizes))
     return jnp.max(jnp.abs(residual)) > rounding + jnp.where(threshold > 0, threshold, 0.0)
+
+
+def _residual(samples: _Standardised, baseline_coef: Array) -> Array:
+    """Return what a baseline leaves of the rewards, less its mean; zero where a sample does not count."""
+    residual = samples.reward - exact_dot(samples.centred, baseline_coef)
+    for _ in range(2):  # the first mean is rounded in units of itself
+        residual = jnp.where(samples.prior > 0, residual - exact_dot(samples.prior, residual), 0.0)
+    return residual
 
 
 def _search(first: _Guess, samples: _Standardised, kl_bound: Array) -> _Guess:
@@ -404,14 +409,20 @@ def _rescaled(reward: Array, features: Array, prior: Array) -> _Samples:
     reward_exponent = jnp.frexp(largest)[1] + 1
     feature_exponents = jnp.frexp(jnp.max(jnp.abs(features), axis=0))[1]
     return _Samples(
-        reward=_shift(jnp.ldexp(reward, -reward_exponent), prior),
-        features=centre_columns(jnp.ldexp(features, -feature_exponents[None, :]), prior),
+        reward=_shift(_scaled(reward, -reward_exponent), prior),
+        features=centre_columns(_scaled(features, -feature_exponents[None, :]), prior),
         prior=prior,
         is_counted=is_counted,
         reward_exponent=reward_exponent,
         feature_exponents=feature_exponents,
         largest=jnp.ldexp(largest, -reward_exponent),
     )
+
+
+def _scaled(values: Array, exponent: Array) -> Array:
+    """Return values times two to a power, faster than `ldexp` where one power is that of many values."""
+    half, one = exponent // 2, jnp.ones((), values.dtype)  # a whole power can be beyond the format
+    return values * jnp.ldexp(one, half) * jnp.ldexp(one, exponent - half)
 
 
 def _standardise(samples: _Samples) -> tuple[_Standardised, Array]:
