@@ -126,7 +126,7 @@ class BoundedML:
         old_chol = policy.cov_chol / fit.size[:, None]
         change, unbiased = _bounded_change(fit, old_chol, samples, self.mean_kl_bound)
         residual = fit.rest - exact_dot(fit.rows, change.at[0].add(-fit.centre))
-        residual = jax.scipy.linalg.solve_triangular(old_chol, residual.T, lower=True).T
+        residual = _divided(residual, old_chol.T)
         scatter = exact_dot(residual.T, residual) / unbiased  # Eq. 15
         factor = _bounded_factor(scatter, self.cov_kl_bound, self.entropy_loss_bound)
         cov_chol = fit.size[:, None] * _as_cov_chol(exact_dot(old_chol, factor))
@@ -143,7 +143,7 @@ def _bounded_change(
         The change in the coordinates of the regression, and the normaliser of its residuals.
     """
     basis = _uncorrelated(fit, samples)
-    rows = jax.scipy.linalg.solve_triangular(basis.T, fit.rows.T, lower=True).T
+    rows = _divided(fit.rows, basis)
     mean_square, axes = jnp.linalg.eigh(exact_dot(rows.T, rows))
     mean_square = jnp.maximum(mean_square, 0.0)
     # The whole way: in units of the old covariance, for features along the axes.
@@ -163,9 +163,15 @@ def _bounded_change(
     moved = exact_dot(axes, shares[:, None] * way)
     moved = exact_dot(jax.scipy.linalg.solve_triangular(basis, moved), old_chol.T)
     # A share s of a fitted feature uses 2 s - s^2 of the scatter that the whole of it does.
-    counted = exact_dot(fit.weights, exact_dot(rows, axes) ** 2)
+    counted = exact_dot(rows.T, fit.weights[:, None] * rows)
+    counted = jnp.sum(axes * exact_dot(counted, axes), axis=0)
     used = jnp.sum((2.0 - shares) * counted / (mean_square + multiplier))
     return moved, normaliser(used, rows.shape[1])
+
+
+def _divided(rows: Float[Array, "n q"], upper: Float[Array, "q q"]) -> Float[Array, "n q"]:
+    """Return rows times the inverse of an upper triangular matrix."""
+    return lax.linalg.triangular_solve(upper, rows, left_side=False, lower=False)
 
 
 def _uncorrelated(fit: Regression, samples: WeightedSamples) -> Float[Array, "q q"]:
