@@ -13,6 +13,10 @@ from creps_jax.typing import Array, Bool, Float, Int, IntScalar, Scalar
 __all__ = ["Archive", "Batch", "centred_reward", "empty_archive", "push", "split_reward", "valid"]
 
 
+_ROUNDING = 1.75
+"""Largest error that counts as rounding, in units of the precision: a sum of a few terms has as much."""
+
+
 class Batch(NamedTuple):
     """Samples as they were drawn and measured; those with anything non-finite carry no information."""
 
@@ -155,7 +159,7 @@ def centred_reward(archive: Archive) -> tuple[Float[Array, " L"], Scalar]:
     halves = jnp.maximum(0.5 * reward - 0.5 * largest, -limit)
     difference = 2.0 * halves + (rest - rest_of_largest)
     centred = jnp.maximum(difference, -2.0 * limit)
-    rounding = jnp.max(archive.reward_rounding, where=is_valid, initial=0.0)
+    rounding = _ROUNDING * jnp.max(archive.reward_rounding, where=is_valid, initial=0.0)
     return jnp.where(is_valid, centred, 0.0), rounding
 
 
