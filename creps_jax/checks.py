@@ -196,8 +196,8 @@ def host_array(
         return array(name, value, shape, note=note)
     if not _is_real(values):
         return array(name, value, shape, note=note)
-    # Zeros have shape and type, and no NaN, which jax does not let pass where it looks out for them.
-    array(name, np.zeros(values.shape, values.dtype), shape, note=note)
+    if shape is not None:
+        _check_shape(name, values.shape, shape, note)
     is_wide_float = values.dtype.kind == "f" and values.dtype.itemsize >= 4
     return values if is_wide_float else values.astype(np.float64)
 
@@ -221,13 +221,7 @@ def array(name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, 
     if result is None or not _is_real(result):
         raise ValueError(f"{name} must be an array of real numbers, got {shown(value)}")
     if shape is not None:
-        fits = len(result.shape) == len(shape) and all(
-            got == wanted or (isinstance(wanted, str) and got > 0)
-            for got, wanted in zip(result.shape, shape, strict=True)
-        )
-        if not fits:
-            wanted = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
-            raise ValueError(f"{name} must have shape {wanted}{note}, got {result.shape}")
+        _check_shape(name, result.shape, shape, note)
     is_wide_float = jnp.issubdtype(result.dtype, jnp.floating) and result.dtype.itemsize >= 4
     return result if is_wide_float else result.astype(jnp.float32)
 
@@ -297,6 +291,16 @@ def instance(name: str, value: Any, *kinds: type) -> None:
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise ValueError(f"{name} must be of type {wanted}, got {shown(value)}")
+
+
+def _check_shape(name: str, got: tuple[int, ...], wanted: tuple[int | str, ...], note: str) -> None:
+    fits = len(got) == len(wanted) and all(
+        size == limit or (isinstance(limit, str) and size > 0)
+        for size, limit in zip(got, wanted, strict=True)
+    )
+    if not fits:
+        text = f"({', '.join(map(str, wanted))}{',' if len(wanted) == 1 else ''})"
+        raise ValueError(f"{name} must have shape {text}{note}, got {got}")
 
 
 def _checked_argument(name: str, value: Any, kind: Any, arrays: _Arrays) -> Any:

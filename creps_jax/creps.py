@@ -33,9 +33,9 @@ from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar, Sca
 
 __all__ = ["Creps", "CrepsInfo", "CrepsSettings", "CrepsState", "creps"]
 
-_ENOUGH_SAMPLES = 3
-"""Samples that the archive should hold for each feature and parameter: weights within the usual KL bound of
-0.5 nats leave about a third of the samples effective."""
+_ENOUGH_SAMPLES = 2
+"""Samples that the archive should hold for each feature and parameter: with fewer, the test on evidence has
+hardly any degree of freedom left, and the covariance never moves."""
 _COARSE_REWARDS = 1e-3
 """Share of the rewards' spread from which on their rounding is worth a warning."""
 
@@ -275,7 +275,7 @@ class CrepsSettings:
             warnings.warn(
                 f"archive_size should be at least {enough}, {_ENOUGH_SAMPLES} samples for each of "
                 f"{self.policy_features.size} features and {theta_dim} parameters, got {self.archive_size}: "
-                "the policy will learn slowly, or from chance",
+                "the covariance will hardly move, or move by chance",
                 stacklevel=3,
             )
 
@@ -350,7 +350,7 @@ def creps(
         baseline_features: Features phi(s) whose expectations over the contexts are kept.
         kl_bound: Largest relative entropy epsilon of one update, in nats. Nothing is compiled anew for
             another one; where it is traced and not above zero, the policy is kept.
-        archive_size: Number L of the last samples that are learned from. At least three for each feature and
+        archive_size: Number L of the last samples that are learned from. At least two for each feature and
             parameter; fewer are warned of.
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale.
         m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's, goes wherever
@@ -503,7 +503,7 @@ def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array,
     change = (policy.coef - reference.coef).T
     whitened = jax.scipy.linalg.solve_triangular(reference.cov_chol, change, lower=True)
     shifts = exact_dot(features, whitened.T)
-    count = jnp.maximum(jnp.sum(is_valid, dtype=jnp.float32), 1.0)
+    count = jnp.maximum(jnp.sum(is_valid, dtype=shifts.dtype), 1.0)
     return without_shift + 0.5 * jnp.sum(shifts**2, where=is_valid[:, None]) / count
 
 

@@ -13,7 +13,7 @@ from creps_jax.archive import push
 from creps_jax.creps import CrepsState, creps
 from creps_jax.features import linear_features
 from creps_jax.policy import LinearGaussian
-from creps_jax.rollouts import device_tuple, mean_outcome, replicate, roll_out
+from creps_jax.rollouts import compiled_roll_out, device_tuple, mean_outcome, replicate
 from creps_jax.tasks import PlainOutcome, Task
 from creps_jax.train import evaluate, make_iteration, train, train_trials
 
@@ -219,7 +219,7 @@ def test_failed_rollouts_pass_while_jax_looks_for_nan(choice):
     with jax.debug_nans(True):
         outcome = evaluate(KEY, NAN_TASK, CONTEXTS, THETAS, devices=list(choice))
         np.testing.assert_array_equal(outcome.reward[:, 0], [2, 2, -50, -50, -50])
-        outcomes, is_failed = roll_out(NAN_TASK, (), KEY, CONTEXTS, THETAS)
+        outcomes, is_failed = compiled_roll_out(NAN_TASK, ())(KEY, CONTEXTS, THETAS)
         assert mean_outcome(outcomes, ~is_failed).reward == 2
         _, log = train(KEY, NAN_TASK, ALGORITHM, START, iterations=2, samples=20, devices=list(choice))
         assert (log.num_failed > 0).all() and np.isfinite(log.mean_reward).all()

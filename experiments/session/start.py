@@ -55,9 +55,9 @@ def complete(settings: Settings) -> Settings:
         UserError: if there are no such features.
     """
     if settings.archive_size is None:
-        # A fit that can be trusted needs three trials for each feature and parameter.
-        num_fitted = feature_map(settings).size + len(settings.parameters)
-        settings = dataclasses.replace(settings, archive_size=max(5 * settings.batch_size, 3 * num_fitted))
+        # An update needs as many trials as there are features and parameters.
+        least = feature_map(settings).size + len(settings.parameters)
+        settings = dataclasses.replace(settings, archive_size=max(5 * settings.batch_size, 2 * least))
     if settings.first_policy is not None:
         return settings
     parameters = [
