@@ -11,7 +11,6 @@ from creps_jax.dual import DualSolution, sample_weights, solve_dual
 from creps_jax.features import (
     FeatureMap,
     linear_features,
-    polynomial_features,
     quadratic_features,
     rbf_features,
 )
@@ -64,7 +63,6 @@ __all__ = [
     "make_iteration",
     "nao_walk",
     "penalised",
-    "polynomial_features",
     "quadratic_features",
     "rbf_features",
     "sample_weights",

@@ -51,6 +51,8 @@ class LearnerSettings:
             paper's unbounded fit.
         cov_kl_bound: how far it may move the covariance, nats.
         start_std: standard deviation of the first policy, whose mean is zero.
+        significance: p-value from which on the covariance stays, see `creps_jax.creps`; None is the paper's
+            update, which moves it whatever the evidence.
         importance_policies: number of last policies whose samples are weighed by importance, see
             `creps_jax.Importance`; None is the paper's archive, all of whose samples count equally.
     """
@@ -64,6 +66,7 @@ class LearnerSettings:
     mean_kl_bound: float | None = None
     cov_kl_bound: float | None = None
     start_std: float = 1.0
+    significance: float | None = None
     importance_policies: int | None = None
 
 
@@ -77,6 +80,7 @@ def make_contender(
         archive_size=settings.archive_size,
         ridge=settings.ridge,
         m_step=make_m_step(settings.mean_kl_bound, settings.cov_kl_bound),
+        significance=settings.significance,
         importance=None if settings.importance_policies is None else Importance(settings.importance_policies),
     )
     dim = task.theta_dim

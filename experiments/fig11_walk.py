@@ -21,11 +21,20 @@ _PAPER = {
     for field in dataclasses.fields(walk.Settings)
     if field.name not in ("robot", "low", "high", "iterations", "trials", "eval_seeds", "physics")
 }
-_PLAIN = ("samples", "first_samples", "repeats", "archive_size", "kl_bound", "mean_kl_bound", "cov_kl_bound")
+_PLAIN = (
+    "samples",
+    "first_samples",
+    "repeats",
+    "archive_size",
+    "kl_bound",
+    "mean_kl_bound",
+    "cov_kl_bound",
+    "significance",
+)
 CONTENDERS: dict[str, dict[str, Any]] = {
     "rbf": {},
     "linear": {"features": Features("linear")},
-    "unbounded": {"mean_kl_bound": None, "cov_kl_bound": None},
+    "unbounded": {"mean_kl_bound": None, "cov_kl_bound": None, "significance": None},
     "penalty": {"features": Features("linear"), "constraint": "penalty"},
     "plain": {name: _PAPER[name] for name in _PLAIN},
     "paper": _PAPER,

@@ -69,6 +69,8 @@ class Settings:
         mean_kl_bound: how far an update may move the policy's mean, nats, see `bounded_ml`; None is the
             paper's unbounded fit.
         cov_kl_bound: how far it may move the covariance, nats.
+        significance: p-value from which on the covariance stays, see `creps_jax.creps`; None is the paper's
+            update.
         features: kind, number and width of the policy's features.
         bounds: which box the parameters are kept in, a name in BOUNDS; None is the robot's own.
         constraint: how they are, a name in CONSTRAINTS: squashed by a sigmoid, or by a penalty of the reward.
@@ -102,6 +104,7 @@ class Settings:
     kl_bound: float = 0.5
     mean_kl_bound: float | None = None
     cov_kl_bound: float | None = None
+    significance: float | None = None
     features: Features = Features("rbf", 5)
     bounds: str | None = None
     constraint: str = "sigmoid"
@@ -185,6 +188,7 @@ _OURS = Settings(
     start_mean=-0.3,
     mean_kl_bound=0.5,
     cov_kl_bound=0.05,
+    significance=0.1,
 )
 SETTINGS = {
     "quick": dataclasses.replace(
@@ -316,6 +320,7 @@ def make_algorithm(settings: Settings) -> Creps:
         kl_bound=settings.kl_bound,
         archive_size=settings.archive_size,
         m_step=make_m_step(settings.mean_kl_bound, settings.cov_kl_bound),
+        significance=settings.significance,
     )
 
 

@@ -28,6 +28,7 @@ import creps_jax as cj
 from creps_jax import rotations, tasks
 from creps_jax.archive import push
 from creps_jax.dual import DualSolution
+from creps_jax.features import polynomial_features
 from creps_jax.motion import dmp, nao_geometry, nao_kinematics
 from creps_jax.motion.robots import NAO, NAO_H25
 from creps_jax.motion.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
@@ -227,7 +228,7 @@ def policy(good: cj.LinearGaussian = POLICY) -> Argument:
 
 
 def state() -> Argument:
-    other = cj.creps(cj.linear_features(3), cj.linear_features(3), archive_size=9)
+    other = cj.creps(cj.linear_features(3), cj.linear_features(3), archive_size=14)
     start = cj.LinearGaussian(jnp.ones((4, 3)), jnp.eye(3))
     return record(STATE, (POLICY, "LinearGaussian"), (other.init(start), "3)"), policy=policy())
 
@@ -659,7 +660,7 @@ ROWS = {
         high=vector((1.0, 1.0), bears=(math.inf,)),
         penalty=number(10.0, least=0.0),
     ),
-    "polynomial_features": row(cj.polynomial_features, use=use_features, dim=count(2), degree=count(3)),
+    "polynomial_features": row(polynomial_features, use=use_features, dim=count(2), degree=count(3)),
     "quadratic_features": row(cj.quadratic_features, use=use_features, dim=count(2)),
     "rbf_features": row(
         cj.rbf_features,

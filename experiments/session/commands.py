@@ -202,7 +202,7 @@ def _tell(command: Tell, say: Callable[[str], None]) -> None:
             f"{update.entropy:.2f}; {update.effective_samples:.1f} of {update.num_valid} trials effective; "
             f"p = {update.p_value:.2g} that rewards depend on parameters by chance"
         )
-    elif not update.is_informative and update.num_valid > 0:
+    elif not update.is_informative and update.num_valid >= sum(update.policy.coef.shape):
         say("the batch is complete, but its rewards tell nothing that the context does not: the policy stays")
     else:
         say(f"the batch is complete, but {update.num_valid} valid trials are too few: the policy stays")
