@@ -156,12 +156,10 @@ def normalised(weights: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def weighted_mean(rows: Float[Array, "n m"], weights: Float[Array, " n"]) -> Float[Array, " m"]:
-    """Return the mean of finite rows, for weights that sum to one; it is exact for columns that are constant.
-
-    Of rows far from zero the sum itself would be rounded as often as there are rows.
-    """
-    one = rows[jnp.argmax(weights)]
-    return one + exact_dot(weights, rows - one[None, :])
+    """Return the mean of finite rows, for weights that sum to one, or zero if all weights are zero."""
+    middle = exact_dot(weights, rows)
+    # The first sum is rounded in units of the offset of the rows, as often as there are rows.
+    return middle + exact_dot(weights, rows - middle[None, :])
 
 
 def safe_sqrt(values: Float[Array, "..."]) -> Float[Array, "..."]:
