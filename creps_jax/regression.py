@@ -173,9 +173,17 @@ def _ratio(top: Array, bottom: Array) -> Array:
     return jnp.minimum(top / bottom, jnp.finfo(top.dtype).max)
 
 
+def _middle(features: Array, weights: Array) -> Array:
+    """Return the mean of each feature, which of one that is constant is that constant, without rounding."""
+    counts = (weights > 0)[:, None]
+    top = jnp.max(jnp.where(counts, features, -jnp.inf), axis=0)
+    bottom = jnp.min(jnp.where(counts, features, jnp.inf), axis=0)
+    return jnp.where(top == bottom, lax.stop_gradient(top), weighted_mean(features, weights))
+
+
 def _basis(features: Array, weights: Array, scale: Array | None) -> Basis:
     size = _size(features)
-    middle = weighted_mean(features, weights)
+    middle = _middle(features, weights)
     centred = (features - middle[None, :]) / size[None, :]
     spread = safe_sqrt(exact_dot(weights, centred**2))
     rounding = jnp.asarray(_ROUNDING * jnp.finfo(features.dtype).eps, features.dtype)
