@@ -33,7 +33,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:obj", ".*"),
     ("py:class", r"(collections|jax|jaxlib|jaxtyping|mujoco|np)\..+"),
-    ("py:class", "Array|ArrayLike|Bool|Float|Int|Key|Path|UInt32|ndarray"),
+    ("py:class", "Array|ArrayLike|Bool|Features|Float|Int|Key|Path|Rewards|UInt32|ndarray"),
 ]
 
 myst_enable_extensions = ["dollarmath"]
