@@ -29,6 +29,7 @@ from creps_jax.keys import threefry
 from creps_jax.linalg import exact_dot
 from creps_jax.mstep import MStep, WeightedSamples, bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
+from creps_jax.programs import KeepsPrograms
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar, ScalarLike
 
 __all__ = ["Creps", "CrepsInfo", "CrepsSettings", "CrepsState", "creps"]
@@ -87,7 +88,7 @@ class CrepsInfo(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Creps:
+class Creps(KeepsPrograms):
     """The algorithm as a record of pure functions, closed over and never traced.
 
     All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters. They are
@@ -135,17 +136,13 @@ class Creps:
             return dataclasses.replace(self)
         return dataclasses.replace(self.settings, kl_bound=kl_bound).algorithm()
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the functions alone: programs are compiled anew where they are needed."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-
     @property
     def _functions(self) -> tuple[Callable, ...]:
         return self.init, self.ask, self.tell, self.mean
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class CrepsSettings:
+class CrepsSettings(KeepsPrograms):
     """The settings of the algorithm as data, see `creps`, and the functions of `Creps` as methods."""
 
     policy_features: FeatureMap
@@ -258,10 +255,6 @@ class CrepsSettings:
         if found is None:
             found = _PROGRAMS[identity] = Programs(settings)
         return found
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the settings alone: programs are compiled anew where they are needed."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def _check_archive_size(self, theta_dim: int) -> None:
         num_fitted = self.policy_features.size + theta_dim
@@ -410,21 +403,23 @@ def _mean(
 class _Samples(NamedTuple):
     """The archive as an update sees it; what does not count is zero."""
 
-    weighted: WeightedSamples
+    features: Array
     baseline: Array
+    theta: Array
     reward: Array
     reward_resolution: Array
     prior: Array
+    is_valid: Array
 
 
 def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) -> tuple[CrepsState, CrepsInfo]:
     """Fit a new policy to the archive."""
     samples, history = _samples(settings, state)
-    (features, theta, _, is_valid), prior = samples.weighted, samples.prior
-    given = samples.reward, samples.baseline, prior
-    dual = solve_dual(*given, kl_bound=kl_bound, resolution=samples.reward_resolution)  # Eq. 13
+    features, baseline, theta, reward, resolution, prior, is_valid = samples
+    given = reward, baseline, prior
+    dual = solve_dual(*given, kl_bound=kl_bound, resolution=resolution)  # Eq. 13
     weights = sample_weights(dual, *given)
-    weighted = samples.weighted._replace(weights=weights)
+    weighted = WeightedSamples(features, theta, weights, is_valid)
     scale = settings.policy_features.scale
     scale = None if scale is None else jnp.asarray(scale, theta.dtype)
     fitted = settings.m_step(state.policy, weighted, ridge=settings.ridge, scale=scale)  # Eq. 14, 15
@@ -441,7 +436,7 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
     policy = jax.tree.map(lambda new, old: jnp.where(is_updated, new, old), fitted, state.policy)
     entropy = gaussian.entropy(policy)
     loss = jnp.maximum(gaussian.entropy(state.policy) - entropy, 0.0)
-    spread = jnp.max(jnp.where(is_valid, jnp.abs(samples.reward), 0.0))
+    spread = jnp.max(jnp.abs(reward))
     info = CrepsInfo(
         dual=dual,
         kl=sample_kl(weights, prior),
@@ -453,7 +448,7 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
         is_updated=is_updated,
         p_value=p_value,
         unsupported_loss=p_value * loss,
-        reward_rounding=jnp.minimum(samples.reward_resolution / jnp.where(spread > 0, spread, 1.0), 1.0),
+        reward_rounding=jnp.minimum(resolution / jnp.where(spread > 0, spread, 1.0), 1.0),
     )
     return CrepsState(policy, state.archive, state.iteration + 1, history), info
 
@@ -472,8 +467,7 @@ def _samples(settings: CrepsSettings, state: CrepsState) -> tuple[_Samples, Poli
     features, theta, baseline = (jnp.where(is_valid[:, None], x, 0.0) for x in (features, theta, baseline))
     prior, history = _prior(settings.importance, state, archive, features)
     reward, resolution = centred_reward(archive)
-    weighted = WeightedSamples(features, theta, prior, is_valid)
-    return _Samples(weighted, baseline, reward, resolution, prior), history
+    return _Samples(features, baseline, theta, reward, resolution, prior, is_valid), history
 
 
 def _prior(

@@ -11,7 +11,7 @@ import math
 import jax.numpy as jnp
 from jax.scipy.special import erfc
 
-from creps_jax.linalg import centre_columns, exact_dot, whitening
+from creps_jax.linalg import centre_columns, cholesky_of_root, exact_dot, normalised, whitening
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
 __all__ = ["blended_cov_chol", "independence_p_value", "share_of_evidence"]
@@ -47,8 +47,7 @@ def independence_p_value(
 
     Source: Fisher 1925, Statistical methods for research workers (analysis of variance).
     """
-    total = jnp.sum(prior)
-    prior = prior / jnp.where(total > 0, total, 1.0)
+    prior = normalised(prior)
     change = jnp.where(prior > 0, weights - prior, 0.0)
     noise, num_features, num_directions = _whitened_noise(prior, features, theta)
     squares = noise**2
@@ -81,9 +80,7 @@ def blended_cov_chol(
     The relative entropy to the old covariance is convex in the new one: the blend keeps its bounds.
     """
     share = jnp.asarray(share, new.dtype)
-    rows = jnp.concatenate([jnp.sqrt(1.0 - share) * old.T, jnp.sqrt(share) * new.T])
-    upper = jnp.linalg.qr(rows, mode="r")
-    blend = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
+    blend = cholesky_of_root(jnp.concatenate([jnp.sqrt(1.0 - share) * old, jnp.sqrt(share) * new], axis=1))
     return jnp.where(share >= 1.0, new, jnp.where(share <= 0.0, old, blend))
 
 

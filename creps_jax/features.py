@@ -230,7 +230,10 @@ class _Radial:
         unit = np.where(np.maximum(np.abs(low), np.abs(high)) > _LARGE, 16.0, 1.0)
         # Multiplied in another order, as compilers like to, extreme numbers overflow or become zero.
         is_extreme = np.any(is_narrow | (unit > 1) | (width < 1 / checks.LARGEST) | (width > checks.LARGEST))
-        in_order = lax.optimization_barrier if is_extreme else lambda numbers: numbers
+
+        def in_order(numbers: Array) -> Array:
+            return jnp.asarray(lax.optimization_barrier(numbers)) if is_extreme else numbers
+
         low, high, width, centers, unit = (
             jnp.asarray(numbers, context.dtype)
             for numbers in (low / unit, high / unit, width / unit, centers / unit, unit)

@@ -12,6 +12,7 @@ from creps_jax.typing import Array, Float, ScalarLike
 
 __all__ = [
     "centre_columns",
+    "cholesky_of_root",
     "exact_dot",
     "normalised",
     "safe_cholesky",
@@ -171,6 +172,12 @@ def safe_sqrt(values: Float[Array, "..."]) -> Float[Array, "..."]:
 def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     """Return the length of a vector, with a gradient of zero where it is zero."""
     return safe_sqrt(jnp.sum(vector**2))
+
+
+def cholesky_of_root(root: Float[Array, "d k"]) -> Float[Array, "d d"]:
+    """Return the lower triangular L with `L L' = root root'` and a diagonal that is not negative; k >= d."""
+    upper = jnp.linalg.qr(root.T, mode="r")
+    return upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
 
 
 def safe_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from creps_jax import checks
-from creps_jax.linalg import exact_dot
+from creps_jax.linalg import cholesky_of_root, exact_dot
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
 from creps_jax.regression import Regression, as_coefficients, coordinates, gauge, normaliser, regress
 from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
@@ -223,8 +223,7 @@ def _bounded_factor(
 
 def _as_cov_chol(root: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """Return the Cholesky factor of a covariance whose root is given, for parameters of size one."""
-    upper = jnp.linalg.qr(root.T, mode="r")
-    cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
+    cov_chol = cholesky_of_root(root)
     # Below the rounding of theta a spread means nothing, and would shrink to zero.
     least = 4.0 * jnp.finfo(cov_chol.dtype).eps
     return cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]

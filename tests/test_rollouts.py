@@ -16,6 +16,7 @@ from creps_jax.policy import LinearGaussian
 from creps_jax.rollouts import compiled_roll_out, device_tuple, mean_outcome, replicate
 from creps_jax.tasks import PlainOutcome, Task
 from creps_jax.train import evaluate, make_iteration, train, train_trials
+from tests.compilations import count_compilations
 
 FIRST, SECOND = jax.devices()
 CHOICES = {"first": (FIRST,), "second": (SECOND,), "both": (FIRST, SECOND), "reversed": (SECOND, FIRST)}
@@ -99,21 +100,6 @@ def devices_of(tree):
 
 def assert_same(left, right):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), left, right)
-
-
-@contextlib.contextmanager
-def count_compilations():
-    compilations = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            compilations.append(duration)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield compilations
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 @runs

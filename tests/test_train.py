@@ -1,6 +1,5 @@
 """Runs are the same as a scan, a loop, resumed, on any number of devices, alone or among trials."""
 
-import contextlib
 import dataclasses
 from typing import NamedTuple
 
@@ -15,6 +14,7 @@ from creps_jax.features import linear_features, quadratic_features
 from creps_jax.policy import LinearGaussian
 from creps_jax.tasks import Task
 from creps_jax.train import evaluate, make_iteration, train, train_trials
+from tests.compilations import count_compilations
 
 SAMPLES, FIRST_SAMPLES, ITERATIONS = 15, 25, 7
 ALGORITHM = creps(linear_features(1), quadratic_features(1), archive_size=40)
@@ -64,21 +64,6 @@ pytestmark = pytest.mark.usefixtures("compiled_as_for_users")
 def run(key, *, task=TASK, algorithm=ALGORITHM, start=POLICY, iterations=ITERATIONS, **settings):
     settings = {"samples": SAMPLES, "first_samples": FIRST_SAMPLES, **settings}
     return train(key, task, algorithm, start, iterations=iterations, **settings)
-
-
-@contextlib.contextmanager
-def count_compilations():
-    compilations = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            compilations.append(duration)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield compilations
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def ignore(state, log):

@@ -20,6 +20,7 @@ from creps_jax.mstep import bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
 from creps_jax.tasks import PlainOutcome, Task
 from creps_jax.train import train
+from tests.compilations import count_compilations
 
 NUM, DIM = 60, 3
 FEATURES = linear_features(2)
@@ -226,23 +227,14 @@ def test_a_training_that_has_ended_is_freed():
 
 
 def test_another_kl_bound_or_batch_size_compiles_no_update_anew():
-    compiled = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            compiled.append(duration)
-
     algorithm = creps(FEATURES, FEATURES, archive_size=43, m_step=bounded_ml())
     state, _ = algorithm.tell(algorithm.init(START), Batch(CONTEXTS[:9], THETAS[:9], REWARDS[:9]))
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
+    with count_compilations() as compiled:
         other = creps(FEATURES, FEATURES, archive_size=43, m_step=bounded_ml(), kl_bound=np.float64(0.1))
         other.tell(state, Batch(CONTEXTS[:9], THETAS[:9], REWARDS[:9]))
         assert not compiled
         for num in (5, 6):
             algorithm.tell(state, Batch(CONTEXTS[:num], THETAS[:num], REWARDS[:num]))
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
     # Only what puts a batch into the archive knows its size.
     assert len(compiled) == 2
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from creps_jax import checks, constraints
+from creps_jax.programs import KeepsPrograms
 from creps_jax.typing import Array, Float, PRNGKey, VectorLike
 
 __all__ = [
@@ -56,7 +57,7 @@ class PlainOutcome(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Task:
+class Task(KeepsPrograms):
     """A contextual task: a record of pure functions, closed over and never traced.
 
     Attributes:
@@ -86,10 +87,6 @@ class Task:
     def programs(self) -> dict[Any, Any]:
         """Compiled programs of this task, freed with it."""
         return {}
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the fields alone: programs are compiled anew where they are needed."""
-        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
 
 def check_outcome(outcome: Any) -> Any:
