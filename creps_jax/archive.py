@@ -8,9 +8,9 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from creps_jax import checks
-from creps_jax.typing import Array, Bool, Float, Int, IntScalar, Scalar
+from creps_jax.typing import Array, Bool, Float, Int, IntScalar, Scalar, ScalarLike
 
-__all__ = ["Archive", "Batch", "centred_reward", "empty_archive", "push", "split_reward", "valid"]
+__all__ = ["Archive", "Batch", "centred_reward", "empty_archive", "push", "split_reward"]
 
 
 _ROUNDING = 1.75
@@ -75,7 +75,12 @@ def empty_archive(
     )
 
 
-def push(archive: Archive, batch: Batch, reward_rest: Float[Array, " n"] | None = None) -> Archive:
+def push(
+    archive: Archive,
+    batch: Batch,
+    reward_rest: Float[Array, " n"] | None = None,
+    reward_eps: ScalarLike | None = None,
+) -> Archive:
     """Add a batch of samples, each in the place of the oldest once the archive is full.
 
     Of a batch larger than the archive its last L samples stay, as if they were added one by one.
@@ -83,8 +88,10 @@ def push(archive: Archive, batch: Batch, reward_rest: Float[Array, " n"] | None 
     Args:
         archive: Where to add them.
         batch: The samples, in the precision of the archive.
-        reward_rest: What the rewards are more precisely, see `split_reward`; None where they were given in
-            the precision of the archive.
+        reward_rest: What the rounding of the rewards to that precision has left out, see `split_reward`;
+            nothing by default.
+        reward_eps: The precision in which the rewards were given, relative to one; by default that of the
+            archive.
 
     Returns:
         The new archive.
@@ -97,12 +104,11 @@ def push(archive: Archive, batch: Batch, reward_rest: Float[Array, " n"] | None 
     # No NaN stays: it would end a program in which jax looks out for them (`jax_debug_nans`).
     batch = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, jnp.zeros_like(x)), batch)
     eps = jnp.finfo(batch.reward.dtype).eps
-    if reward_rest is None:
-        rest, rounding = jnp.zeros_like(batch.reward), eps * jnp.abs(batch.reward)
-    else:
-        rest = jnp.where(is_finite, reward_rest, jnp.zeros_like(reward_rest))
-        # Of float64, whose rounding is about the square of that of float32; and of the rest, as it is kept.
-        rounding = eps**2 * jnp.abs(batch.reward) + eps * jnp.abs(rest)
+    rest = jnp.zeros_like(batch.reward)
+    if reward_rest is not None:
+        rest = jnp.where(is_finite, reward_rest, rest)
+    given_eps = eps if reward_eps is None else jnp.asarray(reward_eps, batch.reward.dtype)
+    rounding = given_eps * jnp.abs(batch.reward) + eps * jnp.abs(rest)
 
     def put(old: Array, new: Array) -> Array:
         return old.at[slots].set(new[first_kept:])
@@ -118,14 +124,9 @@ def push(archive: Archive, batch: Batch, reward_rest: Float[Array, " n"] | None 
     )
 
 
-def valid(archive: Archive) -> Bool[Array, " L"]:
-    """Tell which slots can be learned from: those written with finite numbers only."""
-    return archive.is_valid
-
-
 def split_reward(
     reward: Array | np.ndarray, dtype: DTypeLike
-) -> tuple[Array | np.ndarray, Array | np.ndarray | None]:
+) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """Split rewards into a part in the precision of an archive, and the rest where they are more precise.
 
     Args:
@@ -133,14 +134,11 @@ def split_reward(
         dtype: The precision of the archive.
 
     Returns:
-        Rewards and rest; their sum is the given reward to about twice the digits. None for the rest where the
-        rewards are not more precise.
+        Rewards and rest; their sum is the given reward to about twice the digits.
     """
     # What is too large for the format becomes infinite: such a sample is not valid.
     with np.errstate(over="ignore", invalid="ignore"):
         rounded = reward.astype(dtype)
-        if reward.dtype.itemsize <= np.dtype(dtype).itemsize:
-            return rounded, None
         return rounded, (reward - rounded.astype(reward.dtype)).astype(dtype)
 
 

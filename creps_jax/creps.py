@@ -229,8 +229,8 @@ class CrepsSettings(KeepsPrograms):
             UserWarning: If much of the difference of the rewards is lost in their rounding.
         """
         state = self._checked_state(state)
-        batch, reward_rest = _checked_batch(batch, state.archive)
-        state = state._replace(archive=self.programs.push(state.archive, batch, reward_rest))
+        archive = self.programs.push(state.archive, *_checked_batch(batch, state.archive))
+        state = state._replace(archive=archive)
         return self.programs.update(self.kl_bound, state)
 
     def mean(self, policy: LinearGaussian, contexts: ArrayLike) -> Array:
@@ -566,9 +566,16 @@ def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.nd
     context = checks.host_array("batch.context", batch.context, (num, context_dim), note=note)
     theta = checks.host_array("batch.theta", batch.theta, (num, theta_dim), note=note)
     _warn_of_coarse_rewards(reward)
+    eps = max(jnp.finfo(kind).eps for kind in (reward.dtype, _float_dtype(batch.reward, reward.dtype)))
     reward, rest = split_reward(reward, dtype)
     # NumPy goes to the compiled program as it is: jax would not let NaN pass where it looks out for it.
-    return Batch(*(_converted(each, dtype) for each in (context, theta, reward))), rest
+    return Batch(*(_converted(each, dtype) for each in (context, theta, reward))), rest, np.float32(eps)
+
+
+def _float_dtype(values: Any, otherwise: Any) -> Any:
+    """Return the format of an array of floats, or another one for what is no such array."""
+    dtype = getattr(values, "dtype", otherwise)
+    return dtype if jnp.issubdtype(dtype, jnp.floating) else otherwise
 
 
 def _warn_of_coarse_rewards(reward: Array | np.ndarray) -> None:

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from creps_jax.archive import Archive, Batch, empty_archive, push, valid
+from creps_jax.archive import Archive, Batch, empty_archive, push
 
 CONTEXT_DIM, THETA_DIM = 1, 2
-PUSH, VALID = jax.jit(push), jax.jit(valid)
+PUSH = jax.jit(push)
 
 
 def batch_of(rewards) -> Batch:
@@ -41,11 +41,11 @@ def test_equals_a_bounded_deque(archive_size, batch_sizes):
         oracle.extend(rewards)
         archive = PUSH(archive, batch_of(rewards))
         jax.tree.map(np.testing.assert_array_equal, in_order(archive), batch_of(np.array(oracle)))
-        assert np.sum(VALID(archive)) == len(oracle) == int(archive.size)
+        assert np.sum(archive.is_valid) == len(oracle) == int(archive.size)
 
 
 def test_an_empty_archive_has_nothing_to_learn_from():
-    assert not valid(empty_archive(5, CONTEXT_DIM, THETA_DIM)).any()
+    assert not empty_archive(5, CONTEXT_DIM, THETA_DIM).is_valid.any()
 
 
 def test_push_keeps_its_shapes_and_types_in_a_scan():
@@ -63,7 +63,7 @@ def test_samples_with_anything_not_finite_are_not_valid(field, bad):
     batch = batch_of([1.0, 2.0, 3.0])
     spoilt = batch._replace(**{field: getattr(batch, field).at[1].set(bad)})
     archive = push(empty_archive(4, CONTEXT_DIM, THETA_DIM), spoilt)
-    np.testing.assert_array_equal(valid(archive), [True, False, True, False])
+    np.testing.assert_array_equal(archive.is_valid, [True, False, True, False])
 
 
 def test_refuses_an_archive_without_slots():

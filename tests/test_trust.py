@@ -250,3 +250,16 @@ def test_a_policy_of_tiny_spread_is_searched_in_float64():
         assert thetas.dtype == np.float64 and len(np.unique(thetas)) == NUM
         state, info = algorithm.tell(state, Batch(contexts, thetas, 1e9 * (thetas[:, 0] - 1)))
         assert info.is_updated and state.policy.coef[0, 0] > 1.0
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, jnp.bfloat16, jnp.float32])
+def test_the_rounding_is_that_of_the_format_the_rewards_were_told_in(dtype):
+    """Rewards coarser than the archive, which is of another format, are not taken for exact."""
+    with jax.enable_x64(True):
+        rewards = np.asarray(REWARDS, np.float64)
+        start = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), START)
+        algorithm = creps(FEATURES, FEATURES, archive_size=NUM)
+        given = jnp.asarray(rewards, dtype) if dtype in (jnp.bfloat16, jnp.float32) else rewards.astype(dtype)
+        _, info = algorithm.tell(algorithm.init(start), Batch(CONTEXTS, THETAS, given))
+        expected = 1.75 * float(jnp.finfo(dtype).eps) * np.abs(rewards).max() / np.ptp(rewards)
+        assert float(info.reward_rounding) == pytest.approx(expected, rel=0.05)
