@@ -21,12 +21,12 @@ from jax.typing import ArrayLike
 from creps_jax import checks
 from creps_jax import policy as gaussian
 from creps_jax.archive import Archive, Batch, centred_reward, empty_archive, push, split_reward
-from creps_jax.dual import DualSolution, sample_kl, sample_weights, solve_dual
+from creps_jax.dual import DualSolution, sample_kl, solve_and_weigh
 from creps_jax.evidence import blended_cov_chol, independence_p_value, share_of_evidence
 from creps_jax.features import FeatureMap
 from creps_jax.importance import Importance, PolicyHistory, empty_history, importance_weights, remember
 from creps_jax.keys import threefry
-from creps_jax.linalg import exact_dot
+from creps_jax.linalg import divided, exact_dot
 from creps_jax.mstep import MStep, WeightedSamples, bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
 from creps_jax.programs import KeepsPrograms
@@ -417,15 +417,16 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
     samples, history = _samples(settings, state)
     features, baseline, theta, reward, resolution, prior, is_valid = samples
     given = reward, baseline, prior
-    dual = solve_dual(*given, kl_bound=kl_bound, resolution=resolution)  # Eq. 13
-    weights = sample_weights(dual, *given)
+    dual, weights = solve_and_weigh(*given, kl_bound=kl_bound, resolution=resolution)  # Eq. 13
     weighted = WeightedSamples(features, theta, weights, is_valid)
     scale = settings.policy_features.scale
     scale = None if scale is None else jnp.asarray(scale, theta.dtype)
     fitted = settings.m_step(state.policy, weighted, ridge=settings.ridge, scale=scale)  # Eq. 14, 15
     _check_fitted(fitted, state.policy)
 
-    p_value = independence_p_value(weights, prior, features, theta)
+    inverse = divided(jnp.eye(theta.shape[1], dtype=theta.dtype), state.policy.cov_chol.T)
+    noise = exact_dot(theta - exact_dot(features, state.policy.coef), inverse)
+    p_value = independence_p_value(weights, prior, features, noise)
     if settings.significance is not None:
         share = share_of_evidence(p_value, settings.significance)
         cov_chol = blended_cov_chol(state.policy.cov_chol, fitted.cov_chol, share)
@@ -494,9 +495,7 @@ def _is_usable(policy: LinearGaussian) -> Bool[Array, ""]:
 def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array, is_valid: Array) -> Scalar:
     """Average `policy.kl` over contexts; only the shift of the mean depends on the context."""
     without_shift = gaussian.kl(policy, reference, jnp.zeros_like(features[0]))
-    change = (policy.coef - reference.coef).T
-    whitened = jax.scipy.linalg.solve_triangular(reference.cov_chol, change, lower=True)
-    shifts = exact_dot(features, whitened.T)
+    shifts = exact_dot(features, divided(policy.coef - reference.coef, reference.cov_chol.T))
     count = jnp.maximum(jnp.sum(is_valid, dtype=shifts.dtype), 1.0)
     return without_shift + 0.5 * jnp.sum(shifts**2, where=is_valid[:, None]) / count
 
@@ -556,8 +555,8 @@ def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> 
     return policy
 
 
-def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.ndarray | None]:
-    """Return a batch in the precision of the archive, and the rest of more precise rewards."""
+def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.ndarray, np.float32]:
+    """Return a batch in the precision of the archive, the rest of more precise rewards, and how precise."""
     checks.instance("batch", batch, Batch)
     reward = checks.host_array("batch.reward", batch.reward, ("n",))
     dtype = archive.batch.theta.dtype

@@ -10,11 +10,11 @@ from jax import lax
 from jax.scipy.special import logsumexp
 
 from creps_jax import checks
-from creps_jax.linalg import centre_columns, exact_dot, weighted_ridge, whitening
+from creps_jax.linalg import as_bits, centre_columns, exact_dot, normalised, times_power, whitened_regression
 from creps_jax.minimise import minimise
 from creps_jax.typing import Array, Bool, Float, Int, Num, Scalar, ScalarLike
 
-__all__ = ["DualSolution", "dual_objective", "sample_kl", "sample_weights", "solve_dual"]
+__all__ = ["DualSolution", "dual_objective", "sample_kl", "sample_weights", "solve_and_weigh", "solve_dual"]
 
 Rewards: TypeAlias = Float[Array, " n"] | Num[np.ndarray, " n"] | Sequence[float | int]
 """Rewards; what is of float64 outside of jax loses no digits of their differences."""
@@ -131,6 +131,24 @@ def solve_dual(
 
     Source: Abdolmaleki et al. 2016, Eq. 12 and 13.
     """
+    return _solve_and_weigh(reward, features, valid, kl_bound, resolution)[0]
+
+
+def solve_and_weigh(
+    reward: Rewards,
+    features: Features,
+    valid: Valid | None = None,
+    *,
+    kl_bound: ScalarLike,
+    resolution: ScalarLike | None = None,
+) -> tuple[DualSolution, Float[Array, " n"]]:
+    """Return what `solve_dual` and `sample_weights` do, in the time of the first."""
+    return _solve_and_weigh(reward, features, valid, kl_bound, resolution)
+
+
+def _solve_and_weigh(
+    reward: Any, features: Any, valid: Any, kl_bound: Any, resolution: Any
+) -> tuple[DualSolution, Array]:
     if resolution is not None:
         checks.number("resolution", resolution, least=0.0)
     given, rounding = _without_offset(reward, valid)
@@ -145,7 +163,7 @@ def solve_dual(
 @jax.jit
 def _solve(
     reward: Array, features: Array, prior: Array, kl_bound: Array, relative: Array, absolute: Array
-) -> DualSolution:
+) -> tuple[DualSolution, Array]:
     """Solve for samples of one format; differences are rounding by their size relative to the rewards'."""
     samples = _rescaled(reward, features, prior)
     threshold = relative * samples.largest + jnp.ldexp(absolute, -samples.reward_exponent)
@@ -155,7 +173,7 @@ def _solve(
     kl_bound = jnp.minimum(jnp.where(is_bound, kl_bound, 1.0), 1.0 - jnp.min(_log(samples.prior)))
     standardised, unit = _standardise(samples)
     first = _first_guess(standardised, kl_bound)
-    is_informative = is_bound & _is_informative(first, standardised, threshold / unit)
+    is_informative = is_bound & _is_informative(standardised, threshold / unit)
     guess = _search(first._replace(is_settled=~is_informative), standardised, kl_bound)
     solution = _solution(guess, unit, samples, is_informative)
     # The quality is that of the weights as the caller gets them, with the rounding of the solution.
@@ -163,7 +181,7 @@ def _solve(
     excess = sample_kl(weights, samples.prior * jnp.any(weights > 0).astype(weights.dtype)) - kl_bound
     excess = jnp.where(solution.is_active, excess, jnp.maximum(excess, 0.0))
     mismatch = exact_dot(weights - samples.prior, standardised.whitened)
-    return solution._replace(grad_norm=jnp.sqrt(excess**2 + jnp.sum(mismatch**2)))
+    return solution._replace(grad_norm=jnp.sqrt(excess**2 + jnp.sum(mismatch**2))), weights
 
 
 def sample_weights(
@@ -211,7 +229,7 @@ def sample_kl(weights: Float[Array, " n"], valid: Valid | None = None) -> Scalar
     prior = jnp.ones_like(weights) if valid is None else checks.array("valid", valid)
     if weights.shape != prior.shape:
         raise ValueError(f"weights and valid have to have one shape, got {weights.shape} and {prior.shape}")
-    prior = _normalised(prior).astype(weights.dtype)
+    prior = normalised(prior).astype(weights.dtype)
     # By terms of d log(d / p) - d + p, which are not negative: those of sum d log(d / p) would cancel.
     change = weights / jnp.where(prior > 0, prior, 1.0) - 1.0
     log_ratio = jnp.log1p(jnp.where(change > -1.0, change, 0.0))
@@ -269,6 +287,7 @@ class _Standardised(NamedTuple):
     centred: Array  # features less their mean
     whitening: Array
     whitened: Array  # centred @ whitening: uncorrelated features of mean square one
+    regression: Array  # coefficients of the rewards' regression, directions left out by whitening included
     prior: Array
 
 
@@ -303,14 +322,10 @@ def _first_guess(samples: _Standardised, kl_bound: Array) -> _Guess:
     )
 
 
-def _is_informative(first: _Guess, samples: _Standardised, threshold: Array) -> Array:
+def _is_informative(samples: _Standardised, threshold: Array) -> Array:
     """Say whether a baseline, the best of all in the sense of least squares, leaves more than rounding."""
-    # Unlike the first guess this fit leaves out no direction that the format can tell from rounding.
-    residual = _residual(samples, first.baseline_coef)
-    change = weighted_ridge(samples.centred, residual[:, None], samples.prior, ridge=0.0)[:, 0]
-    coef = first.baseline_coef + change
-    residual = _residual(samples, coef)
-    sizes = exact_dot(jnp.abs(samples.centred), jnp.abs(coef))
+    residual = _residual(samples, samples.regression)
+    sizes = exact_dot(jnp.abs(samples.centred), jnp.abs(samples.regression))
     rounding = _eps(sizes) * (_ROUNDING + _FIT_ROUNDING * jnp.max(sizes))
     return jnp.max(jnp.abs(residual)) > rounding + jnp.where(threshold > 0, threshold, 0.0)
 
@@ -370,10 +385,20 @@ def _improve(guess: _Guess, samples: _Standardised, kl_bound: Array) -> _Guess:
         log_temperature, coef = jnp.log(temperature_of(variables[0])), variables[1:]
         return _dual(log_temperature, coef, residual, samples.whitened, samples.prior, kl_bound)
 
+    def hessian(variables: Array) -> Array:
+        """Return the second derivatives of the objective, in a fraction of the time of `jax.hessian`."""
+        temperature, coef = temperature_of(variables[0]), variables[1:]
+        advantage = (residual - exact_dot(samples.whitened, coef)) / temperature
+        by_temperature, by_both = _dual_hessian(temperature, advantage, samples, kl_bound)
+        # Both derivatives of the temperature by its variable.
+        change = temperature - share
+        scale = jnp.ones_like(variables).at[0].set(change)
+        return (scale[:, None] * by_both * scale[None, :]).at[0, 0].add(change * by_temperature)
+
     start = jnp.zeros(1 + samples.whitened.shape[1], residual.dtype)
     # In units of the temperature: weights change by factors up to e^10 times the whitened features.
     max_change = jnp.full_like(start, 10.0).at[0].set(2.0)
-    minimum = minimise(objective, start, max_steps=40, max_change=max_change)
+    minimum = minimise(objective, start, hessian=hessian, max_steps=40, max_change=max_change)
     change = temperature_of(minimum.point[0])
     improved = guess._replace(
         temperature=unit * change,
@@ -385,6 +410,22 @@ def _improve(guess: _Guess, samples: _Standardised, kl_bound: Array) -> _Guess:
     # Was the unit about right, then another round would be this one over again.
     is_settled = minimum.is_converged & (jnp.abs(jnp.log(change)) < 0.7) & ~_misses(improved, kl_bound)
     return improved._replace(is_settled=is_settled)
+
+
+def _dual_hessian(
+    temperature: Array, advantage: Array, samples: _Standardised, kl_bound: Array
+) -> tuple[Array, Array]:
+    """Return the derivative of the dual by the temperature, and the second ones by it and the coefficients.
+
+    The latter are the weighted covariance of the advantages and the features, over the temperature.
+    """
+    log_weights = jnp.where(samples.prior > 0, advantage + _log(samples.prior), -jnp.inf)
+    weights = jax.nn.softmax(log_weights)
+    columns = jnp.concatenate([advantage[:, None], samples.whitened], axis=1)
+    means = exact_dot(weights, columns)
+    columns = columns - means[None, :]
+    by_both = exact_dot(columns.T, weights[:, None] * columns) / temperature
+    return kl_bound + logsumexp(log_weights) - means[0], by_both
 
 
 def _temperature_floor(guess: _Guess, samples: _Standardised) -> Array:
@@ -409,20 +450,14 @@ def _rescaled(reward: Array, features: Array, prior: Array) -> _Samples:
     reward_exponent = jnp.frexp(largest)[1] + 1
     feature_exponents = jnp.frexp(jnp.max(jnp.abs(features), axis=0))[1]
     return _Samples(
-        reward=_shift(_scaled(reward, -reward_exponent), prior),
-        features=centre_columns(_scaled(features, -feature_exponents[None, :]), prior),
+        reward=_shift(times_power(reward, -reward_exponent), prior),
+        features=centre_columns(times_power(features, -feature_exponents[None, :]), prior),
         prior=prior,
         is_counted=is_counted,
         reward_exponent=reward_exponent,
         feature_exponents=feature_exponents,
         largest=jnp.ldexp(largest, -reward_exponent),
     )
-
-
-def _scaled(values: Array, exponent: Array) -> Array:
-    """Return values times two to a power, faster than `ldexp` where one power is that of many values."""
-    half, one = exponent // 2, jnp.ones((), values.dtype)  # a whole power can be beyond the format
-    return values * jnp.ldexp(one, half) * jnp.ldexp(one, exponent - half)
 
 
 def _standardise(samples: _Samples) -> tuple[_Standardised, Array]:
@@ -435,9 +470,10 @@ def _standardise(samples: _Samples) -> tuple[_Standardised, Array]:
     is_usable = jnp.abs(exponents) < jnp.finfo(unit.dtype).maxexp - _SPARE_EXPONENTS
     centred = jnp.where(is_usable[None, :], samples.features, 0.0)
     # Directions with less spread are left out: in V they would be differences of large numbers.
-    matrix = whitening(centred, samples.prior, least_spread=jnp.sqrt(_eps(unit)))
-    whitened = exact_dot(centred, matrix)
-    return _Standardised(samples.reward / unit, centred, matrix, whitened, samples.prior), unit
+    reward, prior = samples.reward / unit, samples.prior
+    target = reward - exact_dot(prior, reward)
+    matrix, coef = whitened_regression(centred, target, prior, least_spread=jnp.sqrt(_eps(unit)))
+    return _Standardised(reward, centred, matrix, exact_dot(centred, matrix), coef, prior), unit
 
 
 def _advantage(samples: _Standardised, temperature: Array, baseline_coef: Array) -> Array:
@@ -473,32 +509,13 @@ def _mask(reward: Array, features: Array, prior: Array) -> tuple[Array, Array, A
     prior = jnp.where(counts, prior, 0.0)
     reward = jnp.where(counts, reward, 0.0)
     features = jnp.where(counts[:, None], features, 0.0)
-    prior = _normalised(jnp.where(jnp.any(counts), prior, 1.0))  # in its own format, then in that of the rest
+    prior = normalised(jnp.where(jnp.any(counts), prior, 1.0))  # in its own format, then in that of the rest
     return reward, features, prior.astype(reward.dtype)
-
-
-def _normalised(weights: Array) -> Array:
-    """Scale weights of any size, if there are any, to a sum of one; relatively tiny ones become zero."""
-    info, bits = jnp.finfo(weights.dtype), _bits(weights)
-    # Compiled code reads denormal numbers as zero, and divides by multiplying with a reciprocal, which is one
-    # for large divisors. As an integer a denormal number is itself in units of the smallest one.
-    is_denormal = (bits > 0) & (bits < 1 << info.nmant)
-    readable = jnp.where(is_denormal, bits.astype(weights.dtype), weights)
-    exponent = jnp.where(is_denormal, info.minexp - info.nmant, 0)
-    largest = jnp.max(jnp.where(bits > 0, jnp.frexp(readable)[1] + exponent, -(2**30)))
-    weights = jnp.where(bits > 0, jnp.ldexp(readable, exponent - largest), 0.0)  # the largest is about one
-    weights = weights / jnp.maximum(jnp.sum(weights), 0.5)
-    return jnp.where(weights >= info.tiny, weights, 0.0)
-
-
-def _bits(values: Array) -> Array:
-    """Return numbers as integers of the same bits: above zero where and only where the number is."""
-    return lax.bitcast_convert_type(values, jnp.dtype(f"int{jnp.finfo(values.dtype).bits}"))
 
 
 def _is_counted(reward: Array, features: Array, prior: Array) -> Array:
     is_known = jnp.isfinite(reward) & jnp.all(jnp.isfinite(features), axis=1)
-    return (_bits(prior) > 0) & jnp.isfinite(prior) & is_known
+    return (as_bits(prior) > 0) & jnp.isfinite(prior) & is_known
 
 
 def _eps(*values: Any) -> float:

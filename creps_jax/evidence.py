@@ -9,15 +9,16 @@ to the evidence that weights and parameters depend on each other.
 import math
 
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import erfc
 
-from creps_jax.linalg import centre_columns, cholesky_of_root, exact_dot, normalised, whitening
+from creps_jax.linalg import exact_dot, normalised, weighted_mean
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
 __all__ = ["blended_cov_chol", "independence_p_value", "share_of_evidence"]
 
-_LEAST_SPREAD = 3e-4
-"""Directions with less spread than this, as a share of a column's, count as rounding."""
+_LEAST_VARIANCE = 1e-4
+"""Squares of whitened parameters, which have a variance of 2 if Gaussian, are constant below this one."""
 _NUM_TESTS = 3
 
 
@@ -38,7 +39,9 @@ def independence_p_value(
         prior: Weights before rewards were seen, such as those of importance; zero where a sample does not
             count. Their scale does not matter.
         features: Policy features of the contexts. Rows that do not count have to be finite.
-        theta: Parameters, likewise.
+        theta: Parameters, likewise, or what a policy has added to its mean: a linear function of features and
+            parameters tests the same. Of parameters that are nearly dependent on others or on the features,
+            with less than a hundredth of their spread left, only the others are tested.
 
     Returns:
         The p-value: how likely a dependence as strong as this one is where there is none. It is 1 where there
@@ -51,17 +54,21 @@ def independence_p_value(
     change = jnp.where(prior > 0, weights - prior, 0.0)
     noise, num_features, num_directions = _whitened_noise(prior, features, theta)
     squares = noise**2
-    sums = jnp.sum(squares, axis=1, keepdims=True)
-
+    sums = jnp.sum(squares, axis=1, keepdims=True) - num_directions
     num_samples = 1.0 / jnp.maximum(jnp.sum(prior**2), jnp.finfo(prior.dtype).tiny)
     freedom = num_samples - num_features
+
+    total = jnp.sum(change**2 / jnp.where(prior > 0, prior, 1.0))
+    of_noise = exact_dot(change, noise) ** 2
+    of_squares = _explained(change, prior, squares)
+    of_sums = _explained(change, prior, sums)
     one = jnp.ones_like(num_directions)
     p_values = jnp.stack(
         [
-            _regression_p_value(change, prior, noise, num_directions, freedom),
-            _regression_p_value(change, prior, _standardised(squares, prior), num_directions, freedom),
+            _regression_p_value(of_noise, total, num_directions, freedom),
+            _regression_p_value(of_squares, total, num_directions, freedom),
             # The size of whitened noise is constant where there are no more samples than directions.
-            _regression_p_value(change, prior, _standardised(sums, prior), one, freedom - num_directions),
+            _regression_p_value(of_sums, total, one, freedom - num_directions),
         ]
     )
     return jnp.minimum(_NUM_TESTS * jnp.min(p_values), 1.0)
@@ -80,49 +87,56 @@ def blended_cov_chol(
     The relative entropy to the old covariance is convex in the new one: the blend keeps its bounds.
     """
     share = jnp.asarray(share, new.dtype)
-    blend = cholesky_of_root(jnp.concatenate([jnp.sqrt(1.0 - share) * old, jnp.sqrt(share) * new], axis=1))
-    return jnp.where(share >= 1.0, new, jnp.where(share <= 0.0, old, blend))
+    # In units of the old one nothing is lost to the squares of small spreads.
+    change = solve_triangular(old, new, lower=True)
+    blend = (1.0 - share) * jnp.eye(old.shape[0], dtype=new.dtype) + share * exact_dot(change, change.T)
+    is_between = (share > 0.0) & (share < 1.0)
+    factor = jnp.linalg.cholesky(jnp.where(is_between, blend, jnp.eye(old.shape[0], dtype=new.dtype)))
+    return jnp.where(share >= 1.0, new, jnp.where(share <= 0.0, old, jnp.tril(exact_dot(old, factor))))
 
 
 def _whitened_noise(prior: Array, features: Array, theta: Array) -> tuple[Array, Scalar, Scalar]:
     """Return what a regression on the features leaves of the parameters, whitened, and two numbers: of
     independent features, a constant included, and of independent directions of the parameters.
+
+    Columns that depend on others become zero.
     """
-    white_features, num_features = _whitened(features, prior)
-    centred = centre_columns(theta, prior)
-    explained = exact_dot(white_features, exact_dot(white_features.T, prior[:, None] * centred))
-    noise, num_directions = _whitened(centred - explained, prior)
-    return noise, 1.0 + num_features, num_directions
+    counts = (prior > 0)[:, None]
+    columns = jnp.where(counts, jnp.concatenate([features, theta], axis=1), 0.0)
+    means = weighted_mean(columns, prior)
+    columns = jnp.where(counts, columns - means[None, :], 0.0)
+    products = exact_dot(columns.T, prior[:, None] * columns)
+    eps, variance = jnp.finfo(columns.dtype).eps, jnp.diagonal(products)
+    # What is constant up to rounding becomes zero; the others are scaled to a variance of one.
+    is_spread = variance > (4.0 * eps * means) ** 2
+    unit = jnp.where(is_spread, 1.0 / jnp.sqrt(jnp.where(is_spread, variance, 1.0)), 0.0)
+    # One factorisation regresses and whitens, as it frees each column of those before it.
+    identity, rounding = jnp.eye(unit.size, dtype=unit.dtype), 4.0 * unit.size * eps
+    factor = jnp.linalg.cholesky(unit[:, None] * products * unit[None, :] + rounding * identity)
+    is_independent = is_spread & (jnp.diagonal(factor) > 2.0 * rounding**0.5)
+    inverse = solve_triangular(factor, identity, lower=True).T
+    white = jnp.where(is_independent[None, :], unit[:, None] * inverse, 0.0)
+    num_features = features.shape[1]
+    counts = is_independent.astype(prior.dtype)
+    noise = exact_dot(columns, white[:, num_features:])
+    return noise, 1.0 + jnp.sum(counts[:num_features]), jnp.sum(counts[num_features:])
 
 
-def _whitened(columns: Array, prior: Array) -> tuple[Array, Scalar]:
-    """Return uncorrelated columns of mean zero and mean square one, zeros in place of those that depend on
-    others, and how many there are.
-    """
-    centred = centre_columns(columns, prior)
-    matrix = whitening(centred, prior, least_spread=_LEAST_SPREAD)
-    return exact_dot(centred, matrix), jnp.sum(jnp.any(matrix != 0, axis=0), dtype=prior.dtype)
+def _explained(change: Array, prior: Array, columns: Array) -> Array:
+    """Return the part of `change / prior` that each column explains, once it has mean zero and spread one."""
+    means = exact_dot(jnp.stack([change, prior]), columns)
+    spread = exact_dot(prior, columns**2) - means[1] ** 2
+    covariance = means[0] - jnp.sum(change) * means[1]
+    is_spread = spread > _LEAST_VARIANCE
+    return jnp.where(is_spread, covariance**2 / jnp.where(is_spread, spread, 1.0), 0.0)
 
 
-def _standardised(columns: Array, prior: Array) -> Array:
-    """Return columns of mean zero and mean square one; those without spread are zero."""
-    centred = centre_columns(columns, prior)
-    mean_square = exact_dot(prior, centred**2)
-    is_spread = mean_square > jnp.finfo(prior.dtype).eps
-    root = jnp.sqrt(jnp.where(is_spread, mean_square, 1.0))
-    return jnp.where(is_spread[None, :], centred / root[None, :], 0.0)
-
-
-def _regression_p_value(
-    change: Array, prior: Array, regressors: Array, num_regressors: Scalar, freedom: Scalar
-) -> Scalar:
+def _regression_p_value(explained: Array, total: Scalar, num_regressors: Scalar, freedom: Scalar) -> Scalar:
     """Return the p-value of the F-test that no regressor explains `change / prior`.
 
     Regressors are standardised and nearly uncorrelated. `freedom` is what samples have without them.
     """
-    explained = jnp.sum(exact_dot(change, regressors) ** 2)
-    total = jnp.sum(change**2 / jnp.where(prior > 0, prior, 1.0))
-    r_squared = jnp.clip(explained / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
+    r_squared = jnp.clip(jnp.sum(explained) / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
     rest = freedom - num_regressors
     is_testable = (rest >= 1.0) & (num_regressors > 0) & (total > 0)
     p_value = _f_survival(

@@ -248,7 +248,8 @@ class _Radial:
             distance = jnp.abs(inside)
             is_nearest = distance == jnp.min(distance, axis=0)[None, :]
             costs = jnp.where(is_narrow[None, :], jnp.where(is_nearest, 0.0, jnp.inf), costs)
-        return jax.nn.softmax(-jnp.sum(costs, axis=1))
+        # Without the barrier compilers put the costs into the sum over them: all of them anew for each.
+        return jax.nn.softmax(jnp.asarray(lax.optimization_barrier(-jnp.sum(costs, axis=1))))
 
 
 def _centers(low: np.ndarray, high: np.ndarray, num_centers: int) -> np.ndarray:

@@ -8,20 +8,22 @@ import jax.numpy as jnp
 from jax import lax
 
 from creps_jax import checks
-from creps_jax.typing import Array, Float, ScalarLike
+from creps_jax.typing import Array, Float, Int, ScalarLike
 
 __all__ = [
+    "as_bits",
     "centre_columns",
-    "cholesky_of_root",
+    "divided",
     "exact_dot",
     "normalised",
     "safe_cholesky",
     "safe_norm",
     "safe_sqrt",
     "thomas_solve",
+    "times_power",
     "weighted_mean",
     "weighted_ridge",
-    "whitening",
+    "whitened_regression",
 ]
 
 _Pair: TypeAlias = tuple[Array, Array]
@@ -143,17 +145,38 @@ def weighted_ridge(
 
 
 def normalised(weights: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Divide weights, not negative, by their sum, which may be too large for the format; zeros stay zeros.
+    """Divide weights, not negative and of any size, by their sum; relatively tiny ones become zero.
 
-    Numbers too small to be normal are zeros to XLA, and so are reciprocals of the largest, which it
-    multiplies by where division is asked for: weights are first taken to the middle of their range.
+    Zeros stay zeros. Compiled code reads denormal numbers as zero, and divides by multiplying with a
+    reciprocal, which is one for large divisors; sums of large numbers overflow.
     """
-    is_large = jnp.max(weights) > 1.0
-    weights = weights * jnp.where(is_large, jnp.asarray(2.0**-64, weights.dtype), 2.0**64)
-    largest = lax.stop_gradient(jnp.max(weights))  # it cancels
-    weights = weights / jnp.where(largest > 0, largest, 1.0)
-    total = jnp.sum(weights)
-    return weights / jnp.where(total > 0, total, 1.0)
+    info, bits = jnp.finfo(weights.dtype), as_bits(weights)
+    # As an integer a denormal number is itself in units of the smallest one.
+    is_denormal = (bits > 0) & (bits < 1 << info.nmant)
+    in_units = jnp.where(is_denormal, bits.astype(weights.dtype), 0.0)
+    of_units = info.minexp - info.nmant
+    largest = jnp.where(
+        jnp.any(bits >= 1 << info.nmant),
+        jnp.frexp(jnp.max(weights))[1],
+        jnp.frexp(jnp.max(in_units))[1] + of_units,
+    )
+    # By powers of two the largest becomes about one. It cancels, and needs no gradient.
+    others = times_power(weights, -largest)
+    weights = jnp.where(is_denormal, times_power(in_units, of_units - largest), others)
+    weights = jnp.where(weights >= info.tiny, weights, 0.0)
+    return weights / jnp.maximum(jnp.sum(weights), 0.5)
+
+
+def as_bits(values: Float[Array, "..."]) -> Int[Array, "..."]:
+    """Return numbers as integers of the same bits: above zero where and only where the number is."""
+    values = lax.stop_gradient(values)
+    return lax.bitcast_convert_type(values, jnp.dtype(f"int{jnp.finfo(values.dtype).bits}"))
+
+
+def times_power(values: Float[Array, "..."], exponent: Int[Array, "..."] | int) -> Float[Array, "..."]:
+    """Multiply values by two to a power, faster than `ldexp` where one power is that of many values."""
+    half, one = exponent // 2, jnp.ones((), values.dtype)  # a whole power can be beyond the format
+    return values * jnp.ldexp(one, half) * jnp.ldexp(one, exponent - half)
 
 
 def weighted_mean(rows: Float[Array, "n m"], weights: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -174,10 +197,9 @@ def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
     return safe_sqrt(jnp.sum(vector**2))
 
 
-def cholesky_of_root(root: Float[Array, "d k"]) -> Float[Array, "d d"]:
-    """Return the lower triangular L with `L L' = root root'` and a diagonal that is not negative; k >= d."""
-    upper = jnp.linalg.qr(root.T, mode="r")
-    return upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
+def divided(rows: Float[Array, "n q"], upper: Float[Array, "q q"]) -> Float[Array, "n q"]:
+    """Return rows times the inverse of an upper triangular matrix."""
+    return lax.linalg.triangular_solve(upper, rows, left_side=False, lower=False)
 
 
 def safe_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
@@ -230,26 +252,41 @@ def centre_columns(rows: Float[Array, "n m"], weights: Float[Array, " n"]) -> Fl
     return jnp.where(is_constant[None, :], 0.0, centred)
 
 
-def whitening(
-    centred: Float[Array, "n m"], weights: Float[Array, " n"], *, least_spread: ScalarLike
-) -> Float[Array, "m k"]:
+def whitened_regression(
+    centred: Float[Array, "n m"],
+    target: Float[Array, " n"],
+    weights: Float[Array, " n"],
+    *,
+    least_spread: ScalarLike,
+) -> tuple[Float[Array, "m k"], Float[Array, " m"]]:
     """Return the matrix W for which the columns of `centred @ W` are uncorrelated with mean square one.
 
     Args:
         centred: Rows with a mean of zero, from `centre_columns`.
+        target: What the rows are to explain, with a mean of zero as well.
         weights: Weights of the rows in these means, not negative; they sum to one.
         least_spread: Directions with less spread than this, in columns scaled to spread one, are taken for
             rounding: their columns of W are zero.
 
     Returns:
-        W; it has k = min(n, m) columns.
+        W, with k = min(n, m) columns, and the coefficients of the least-squares fit of the target. The fit
+        leaves out only directions that the format can't tell from rounding, whatever `least_spread`.
     """
-    rows = jnp.sqrt(weights)[:, None] * centred
+    root = jnp.sqrt(weights)
+    rows = root[:, None] * centred
     unscale = _invert_above(jnp.linalg.norm(rows, axis=0), 0.0)
+    both = jnp.concatenate([rows * unscale[None, :], (root * target)[:, None]], axis=1)
     # Singular values of the columns, not eigenvalues of their products: those would square the rounding.
-    triangular = jnp.linalg.qr(rows * unscale[None, :], mode="r")
-    _, singular_values, axes = jnp.linalg.svd(triangular, full_matrices=False)
-    return unscale[:, None] * axes.T * _invert_above(singular_values, least_spread)[None, :]
+    triangular = jnp.linalg.qr(both, mode="r")[: centred.shape[1]]
+    columns, values = triangular[:, :-1], triangular[:, -1]
+    left, singular_values, axes = jnp.linalg.svd(columns, full_matrices=False)
+    inverse = axes.T * _invert_above(singular_values, least_spread)[None, :]
+    # First what is certain: in the directions of rounding the target itself would have huge coefficients.
+    coef = exact_dot(inverse, exact_dot(values, left))
+    least = 4.0 * math.sqrt(centred.shape[1]) * jnp.finfo(centred.dtype).eps
+    rest = exact_dot(values - exact_dot(columns, coef), left)
+    coef = coef + exact_dot(singular_values / (singular_values**2 + least**2) * rest, axes)
+    return unscale[:, None] * inverse, unscale * coef
 
 
 def _invert_above(values: Array, threshold: ScalarLike) -> Array:

@@ -12,7 +12,9 @@ from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
 __all__ = ["Minimum", "minimise"]
 
 _NUM_TRIALS = 6
-"""Step lengths tried at once: 1, 1/4, ..., 1/1024 of the Newton step."""
+"""Step lengths that are tried: 1, 1/4, ..., 1/1024 of the Newton step."""
+_NEAR_MINIMUM = 0.5
+"""Slope, as a share of that at the start, up to which a point is near the minimum along a step."""
 _FLAT = 8.0
 """Least curvature of an axis, as a share of the largest, in units of the rounding of the format."""
 
@@ -36,10 +38,23 @@ class _Search(NamedTuple):
     is_stalled: Array
 
 
+class _Trials(NamedTuple):
+    """The best of the points that were tried along a step."""
+
+    point: Array
+    value: Array
+    grad: Array
+    is_found: Array
+    is_good: Array
+    length: Array  # of the next trial
+    num: Array
+
+
 def minimise(
     function: Callable[[Float[Array, " k"]], Scalar],
     start: Float[Array, " k"],
     *,
+    hessian: Callable[[Float[Array, " k"]], Float[Array, "k k"]] | None = None,
     max_steps: int = 50,
     tolerance: ScalarLike | None = None,
     max_change: ScalarLike | Float[Array, " k"] = 1e3,
@@ -54,6 +69,7 @@ def minimise(
     Args:
         function: What to minimise; scaled such that values and gradients of order one matter.
         start: First point, where the function has to be finite.
+        hessian: The matrix of second derivatives, where it is known; by default that of `jax.hessian`.
         max_steps: Largest number of Newton steps.
         tolerance: Norm of the gradient at which the search ends; by default 9e-7 in float32 and 2e-14 in
             float64.
@@ -75,7 +91,7 @@ def minimise(
         tolerance = float(jnp.finfo(start.dtype).eps) ** (7 / 8)
     limits = jnp.broadcast_to(jnp.asarray(max_change, start.dtype), start.shape)
     value_and_grad = jax.value_and_grad(function)
-    hessian = jax.hessian(function)
+    hessian = jax.hessian(function) if hessian is None else hessian
 
     def is_running(search: _Search) -> Array:
         is_open = jnp.linalg.norm(search.grad) > tolerance
@@ -114,22 +130,40 @@ def _newton_step(grad: Array, hessian: Array, max_change: Array) -> Array:
 def _line_search(
     value_and_grad: Callable[[Array], tuple[Array, Array]], search: _Search, step: Array
 ) -> _Search:
-    """Move along the step by the longest trial length that is as good as the best one, to rounding."""
-    lengths = 0.25 ** jnp.arange(_NUM_TRIALS, dtype=step.dtype)
-    points = search.point[None, :] + lengths[:, None] * step[None, :]
-    values, grads = jax.vmap(value_and_grad)(points)
-    slope, slopes = jnp.sum(search.grad * step), jnp.sum(grads * step[None, :], axis=1)
+    """Move along the step by the longest trial length that is as good as the best one, to rounding.
+
+    Trials end with a length that is near the minimum along the step, as the first one mostly is.
+    """
+    slope = jnp.sum(search.grad * step)
     rounding = 8.0 * jnp.finfo(step.dtype).eps * (1.0 + jnp.abs(search.value))
-    # Sufficient decrease, or (Hager & Zhang 2005, approximate Wolfe) as much as can be told from the slope.
-    is_lower = values <= search.value + 1e-4 * lengths * slope - rounding
-    is_flatter = (values <= search.value + rounding) & (slopes <= -0.8 * slope)
-    is_finite = jnp.isfinite(values) & jnp.all(jnp.isfinite(grads), axis=1)
-    is_acceptable = is_finite & (is_lower | is_flatter)
-    best = jnp.min(jnp.where(is_acceptable, values, jnp.inf))
-    choice = jnp.argmax(is_acceptable & (values <= best + rounding))  # the first of them: the longest
-    point, value, grad = points[choice], values[choice], grads[choice]
-    is_progress = (value < search.value - rounding) | (jnp.linalg.norm(grad) < jnp.linalg.norm(search.grad))
-    is_moved = is_acceptable[choice] & is_progress
-    moved = _Search(point, value, grad, search.num_steps + 1, jnp.zeros((), bool))
-    stalled = search._replace(num_steps=search.num_steps + 1, is_stalled=jnp.ones((), bool))
-    return jax.tree.map(lambda new, old: jnp.where(is_moved, new, old), moved, stalled)
+
+    def is_going_on(trials: _Trials) -> Array:
+        return ~trials.is_good & (trials.num < _NUM_TRIALS)
+
+    def try_next(trials: _Trials) -> _Trials:
+        length = trials.length
+        point = search.point + length * step
+        value, grad = value_and_grad(point)
+        new_slope = jnp.sum(grad * step)
+        # Sufficient decrease, or (approximate Wolfe, Hager & Zhang 2005) what the slope tells of it.
+        is_lower = value <= search.value + 1e-4 * length * slope - rounding
+        is_flatter = (value <= search.value + rounding) & (new_slope <= -0.8 * slope)
+        is_finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(grad))
+        is_acceptable = is_finite & (is_lower | is_flatter)
+        is_better = is_acceptable & (~trials.is_found | (value < trials.value - rounding))
+        point, value, grad = (
+            jnp.where(is_better, new, old)
+            for new, old in ((point, trials.point), (value, trials.value), (grad, trials.grad))
+        )
+        is_good = is_acceptable & (jnp.abs(new_slope) <= _NEAR_MINIMUM * jnp.abs(slope))
+        return _Trials(
+            point, value, grad, trials.is_found | is_acceptable, is_good, 0.25 * length, trials.num + 1
+        )
+
+    no, none, one = jnp.zeros((), bool), jnp.zeros((), jnp.int32), jnp.ones((), step.dtype)
+    start = _Trials(search.point, search.value, search.grad, no, no, one, none)
+    best = lax.while_loop(is_going_on, try_next, start)
+    is_progress = (best.value < search.value - rounding) | (
+        jnp.linalg.norm(best.grad) < jnp.linalg.norm(search.grad)
+    )
+    return _Search(best.point, best.value, best.grad, search.num_steps + 1, ~(best.is_found & is_progress))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from creps_jax import checks
-from creps_jax.linalg import cholesky_of_root, exact_dot
+from creps_jax.linalg import divided, exact_dot
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
 from creps_jax.regression import Regression, as_coefficients, coordinates, gauge, normaliser, regress
 from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
@@ -126,7 +126,7 @@ class BoundedML:
         old_chol = policy.cov_chol / fit.size[:, None]
         change, unbiased = _bounded_change(fit, old_chol, samples, self.mean_kl_bound)
         residual = fit.rest - exact_dot(fit.rows, change.at[0].add(-fit.centre))
-        residual = _divided(residual, old_chol.T)
+        residual = divided(residual, old_chol.T)
         scatter = exact_dot(residual.T, residual) / unbiased  # Eq. 15
         factor = _bounded_factor(scatter, self.cov_kl_bound, self.entropy_loss_bound)
         cov_chol = fit.size[:, None] * _as_cov_chol(exact_dot(old_chol, factor))
@@ -143,7 +143,7 @@ def _bounded_change(
         The change in the coordinates of the regression, and the normaliser of its residuals.
     """
     basis = _uncorrelated(fit, samples)
-    rows = _divided(fit.rows, basis)
+    rows = divided(fit.rows, basis)
     mean_square, axes = jnp.linalg.eigh(exact_dot(rows.T, rows))
     mean_square = jnp.maximum(mean_square, 0.0)
     # The whole way: in units of the old covariance, for features along the axes.
@@ -167,11 +167,6 @@ def _bounded_change(
     counted = jnp.sum(axes * exact_dot(counted, axes), axis=0)
     used = jnp.sum((2.0 - shares) * counted / (mean_square + multiplier))
     return moved, normaliser(used, rows.shape[1])
-
-
-def _divided(rows: Float[Array, "n q"], upper: Float[Array, "q q"]) -> Float[Array, "n q"]:
-    """Return rows times the inverse of an upper triangular matrix."""
-    return lax.linalg.triangular_solve(upper, rows, left_side=False, lower=False)
 
 
 def _uncorrelated(fit: Regression, samples: WeightedSamples) -> Float[Array, "q q"]:
@@ -223,7 +218,8 @@ def _bounded_factor(
 
 def _as_cov_chol(root: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """Return the Cholesky factor of a covariance whose root is given, for parameters of size one."""
-    cov_chol = cholesky_of_root(root)
+    upper = jnp.linalg.qr(root.T, mode="r")
+    cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
     # Below the rounding of theta a spread means nothing, and would shrink to zero.
     least = 4.0 * jnp.finfo(cov_chol.dtype).eps
     return cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]

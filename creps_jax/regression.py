@@ -191,15 +191,19 @@ def _basis(features: Array, weights: Array, scale: Array | None) -> Basis:
         unit = size * jnp.where(spread > rounding, spread, 1.0)
     else:
         unit = jnp.clip(scale, jnp.maximum(1e-9 * size, 1e-37), jnp.minimum(1e9 * size, 1e37))
-    # The nearest to a constant, made of the steadiest features.
-    steadiness = lax.stop_gradient(jnp.maximum(spread, rounding))
-    ones = jnp.ones((features.shape[0], 1), features.dtype)
-    constant = weighted_ridge(features / size[None, :], ones, weights, ridge=0.0, scale=steadiness)[:, 0]
-    constant = constant * unit / size
-    # Of features that sum to one it is that sum, wherever the samples are.
+    # Of features that sum to one the constant is that sum, wherever the samples are.
     each = jnp.ones_like(unit) if scale is None else scale
     short = jnp.where(weights > 0, 1.0 - jnp.sum(features / each[None, :], axis=1), 0.0)
-    constant = jnp.where(jnp.all(jnp.abs(short) < _SUM_IS_ONE), unit / each, constant)
+
+    def nearest_constant() -> Array:
+        # Made of the steadiest features.
+        steadiness = lax.stop_gradient(jnp.maximum(spread, rounding))
+        ones = jnp.ones((features.shape[0], 1), features.dtype)
+        constant = weighted_ridge(features / size[None, :], ones, weights, ridge=0.0, scale=steadiness)
+        return constant[:, 0] * unit / size
+
+    is_sum = jnp.all(jnp.abs(short) < _SUM_IS_ONE)
+    constant = lax.cond(is_sum, lambda: unit / each, nearest_constant)
 
     share = exact_dot(middle / unit, constant)
     has_constant = share > 0.5

@@ -489,6 +489,16 @@ def test_rewards_that_the_baseline_explains_leave_the_prior(kind, offset, num_fe
     assert_gives_the_prior(reward, features)
 
 
+@pytest.mark.parametrize("kind", ["radial", "wide radial", "monomials"])
+@pytest.mark.parametrize("size", [1e-5, 1e-3, 0.1])
+@pytest.mark.parametrize("num_features", [2, 6, 11])
+def test_a_little_that_the_baseline_does_not_explain_counts(kind, size, num_features):
+    rng = np.random.default_rng(9)
+    features = np.float32(span(kind, rng.uniform(size=NUM), num_features))
+    reward = features @ np.float32(rng.normal(size=num_features)) + size * rng.normal(size=NUM)
+    assert bool(solve_dual(jnp.float32(reward), jnp.asarray(features), kl_bound=0.5).is_informative)
+
+
 def assert_gives_the_prior(reward, features, valid=None, **settings):
     reward, features = jnp.asarray(reward, jnp.float32), jnp.asarray(features, jnp.float32)
     valid = jnp.ones(reward.shape, bool) if valid is None else jnp.asarray(valid)

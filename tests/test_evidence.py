@@ -57,6 +57,25 @@ def test_units_and_dependent_columns_do_not_change_the_p_value(key):
     np.testing.assert_allclose(independence_p_value(weights, prior, features, again), plain, rtol=0.02)
 
 
+@pytest.mark.parametrize("offset", [0.0, 30.0, 1e4])
+@pytest.mark.parametrize("slope", [0.0, 1.0, 100.0])
+def test_neither_offsets_nor_means_that_follow_the_context_change_the_p_value(key, offset, slope):
+    features, theta, weights = samples(key, 100, 4, 0.3)
+    prior = jnp.ones(100)
+    plain = independence_p_value(weights, prior, features, theta)
+    moved = theta + offset + slope * features[:, 1:2]
+    np.testing.assert_allclose(independence_p_value(weights, prior, features + offset, moved), plain, rtol=0.1)
+
+
+@pytest.mark.parametrize("spread", [1e-1, 1e-3, 1e-6, 0.0])
+def test_nearly_dependent_parameters_leave_the_others_to_be_tested(key, spread):
+    features, theta, weights = samples(key, 200, 3, 1.0)
+    nearly = theta.at[:, 2].set(theta[:, 1] + spread * theta[:, 2])
+    assert independence_p_value(weights, jnp.ones(200), features, nearly) < 1e-3
+    noise = jax.random.permutation(key, weights)
+    assert independence_p_value(noise, jnp.ones(200), features, nearly) > 1e-3
+
+
 @pytest.mark.parametrize("num", [0, 1, 2, 6])
 def test_too_few_samples_are_no_evidence(key, num):
     features, theta, weights = samples(key, 20, 3, 5.0)

@@ -14,7 +14,7 @@ from creps_jax.linalg import (
     thomas_solve,
     weighted_mean,
     weighted_ridge,
-    whitening,
+    whitened_regression,
 )
 
 
@@ -211,7 +211,7 @@ def test_whitening_makes_columns_uncorrelated():
     weights = jnp.where(jnp.arange(60) < 40, 1 / 40, 0.0)
     centred = centre_columns(jnp.float32(rows), weights)
     assert np.all(centred[40:] == 0)
-    white = centred @ whitening(centred, weights, least_spread=1e-4)
+    white = centred @ whitened_regression(centred, centred[:, 0], weights, least_spread=1e-4)[0]
     np.testing.assert_allclose(white.T @ white / 40, np.eye(3), atol=1e-3)
     np.testing.assert_allclose(white.sum(0) / 40, 0.0, atol=1e-4)
 
@@ -223,7 +223,7 @@ def test_whitening_drops_what_is_constant_or_collinear():
     weights = jnp.full(30, 1 / 30)
     centred = centre_columns(rows, weights)
     assert np.all(centred[:, 2:4] == 0)
-    matrix = whitening(centred, weights, least_spread=0.1)
+    matrix, _ = whitened_regression(centred, jnp.float32(column), weights, least_spread=0.1)
     white = centred @ matrix
     assert np.all(np.isfinite(matrix))
     assert np.sum(np.sum(np.asarray(white) ** 2, axis=0) > 1) == 1
@@ -233,7 +233,19 @@ def test_whitening_of_fewer_rows_than_columns():
     rows = jnp.float32(np.random.default_rng(12).normal(size=(4, 6)))
     weights = jnp.full(4, 0.25)
     centred = centre_columns(rows, weights)
-    white = centred @ whitening(centred, weights, least_spread=1e-4)
+    white = centred @ whitened_regression(centred, centred[:, 0], weights, least_spread=1e-4)[0]
     assert white.shape == (4, 4)
     # Four points about their mean span three directions.
     np.testing.assert_allclose(np.sort(np.linalg.eigvalsh(white.T @ white / 4)), [0, 1, 1, 1], atol=1e-4)
+
+
+@pytest.mark.parametrize(("num", "gap"), [(60, 1.0), (60, 1e-3), (60, 1e-5), (4, 1.0)])
+def test_the_regression_beside_whitening_sees_directions_that_whitening_leaves_out(num, gap):
+    rng = np.random.default_rng(13)
+    column, other = rng.normal(size=(2, num))
+    weights = jnp.full(num, 1 / num)
+    centred = centre_columns(jnp.float32(np.stack([column, column + gap * other], axis=1)), weights)
+    target = centred[:, 1] - centred[:, 0]
+    matrix, coef = whitened_regression(centred, target, weights, least_spread=0.1)
+    assert np.sum(np.any(np.asarray(matrix) != 0, axis=0)) == (2 if gap == 1.0 else 1)
+    np.testing.assert_allclose(centred @ coef, target, atol=1e-6 + 0.02 * np.abs(target).max())
