@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.special import erfc
 
-from creps_jax.linalg import exact_dot, normalised, weighted_mean
+from creps_jax.linalg import exact_dot, normalised, safe_sqrt, weighted_mean
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
 __all__ = ["blended_cov_chol", "independence_p_value", "share_of_evidence"]
@@ -103,13 +103,16 @@ def _whitened_noise(prior: Array, features: Array, theta: Array) -> tuple[Array,
     """
     counts = (prior > 0)[:, None]
     columns = jnp.where(counts, jnp.concatenate([features, theta], axis=1), 0.0)
+    # Squares of the columns have to stay within the format, whatever their units.
+    size = jnp.max(jnp.abs(columns), axis=0)
+    columns = columns / jnp.where(size > 0, size, 1.0)[None, :]
     means = weighted_mean(columns, prior)
     columns = jnp.where(counts, columns - means[None, :], 0.0)
     products = exact_dot(columns.T, prior[:, None] * columns)
-    eps, variance = jnp.finfo(columns.dtype).eps, jnp.diagonal(products)
-    # What is constant up to rounding becomes zero; the others are scaled to a variance of one.
-    is_spread = variance > (4.0 * eps * means) ** 2
-    unit = jnp.where(is_spread, 1.0 / jnp.sqrt(jnp.where(is_spread, variance, 1.0)), 0.0)
+    eps, spread = jnp.finfo(columns.dtype).eps, safe_sqrt(jnp.diagonal(products))
+    # What is constant up to rounding becomes zero; the others are scaled to a spread of one.
+    is_spread = spread > 4.0 * eps * jnp.abs(means)
+    unit = jnp.where(is_spread, 1.0 / jnp.where(is_spread, spread, 1.0), 0.0)
     # One factorisation regresses and whitens, as it frees each column of those before it.
     identity, rounding = jnp.eye(unit.size, dtype=unit.dtype), 4.0 * unit.size * eps
     factor = jnp.linalg.cholesky(unit[:, None] * products * unit[None, :] + rounding * identity)
