@@ -90,7 +90,7 @@ def push(
         batch: The samples, in the precision of the archive.
         reward_rest: What the rounding of the rewards to that precision has left out, see `split_reward`;
             nothing by default.
-        reward_eps: The precision in which the rewards were given, relative to one; by default that of the
+        reward_eps: Machine epsilon of the format in which the rewards were given; by default that of the
             archive.
 
     Returns:

@@ -37,6 +37,8 @@ __all__ = ["Creps", "CrepsInfo", "CrepsSettings", "CrepsState", "creps"]
 _ENOUGH_SAMPLES = 2
 """Samples that the archive should hold for each feature and parameter: with fewer, the test on evidence has
 hardly any degree of freedom left, and the covariance never moves."""
+_LARGEST = {"coef": 1e36, "cov_chol": checks.LARGEST}
+"""The largest numbers of a first policy."""
 _COARSE_REWARDS = 1e-3
 """Share of the rewards' spread from which on their rounding is worth a warning."""
 
@@ -76,12 +78,15 @@ class CrepsInfo(NamedTuple):
     """False where the policy was kept, to the bit: there were too few samples to fit one, or the rewards do
     not differ after the baseline."""
     p_value: Scalar
-    """How likely weights that have nothing to do with the parameters would depend on them as strongly as
-    these do; see `creps_jax.evidence`. The covariance moves only where this is below `significance`."""
+    """p-value of the test in `creps_jax.evidence`: the probability, from 0 to 1, of a dependence between
+    weights and parameters at least this strong if there is none. The covariance moves only where it is
+    below `significance`."""
     unsupported_loss: Scalar
-    """Entropy that this update took without evidence, in nats: the loss of entropy times the p-value. Its sum
-    over a search warns of exploration that went without evidence: d parameters whose spread has fallen to
-    exp(-x) by chance add up to about d x."""
+    """Estimate of the entropy that this update took by chance, in nats: the loss of entropy times
+    `3 p_value / significance` (twice the p-value without `significance`). Where rewards do not depend on the
+    parameters its expectation is the whole loss; where the evidence is strong it is nearly zero. Its sum over
+    a search warns of exploration that went without evidence: d parameters whose spread has fallen to exp(-x)
+    by chance add up to about d x."""
     reward_rounding: Scalar
     """Rounding error of the rewards, in the precision in which they were told, as a share of their spread.
     From about 0.1 on little can be learned: tell rewards in float64, or without their common offset."""
@@ -131,10 +136,19 @@ class Creps(KeepsPrograms):
         return {} if self.settings is None else self.settings.programs.others
 
     def with_kl_bound(self, kl_bound: ScalarLike) -> "Creps":
-        """Return the algorithm with another KL bound, unless a function of it is a user's own."""
+        """Return the algorithm with another KL bound, for which nothing is compiled anew.
+
+        An algorithm with a function of a user's own has no settings: it is returned as it is.
+
+        Args:
+            kl_bound: Largest relative entropy of one update, in nats.
+
+        Raises:
+            ValueError: If the bound is not a number above 0.
+        """
         if self.settings is None:
             return dataclasses.replace(self)
-        return dataclasses.replace(self.settings, kl_bound=kl_bound).algorithm()
+        return dataclasses.replace(self.settings, kl_bound=_checked_kl_bound(kl_bound)).algorithm()
 
     @property
     def _functions(self) -> tuple[Callable, ...]:
@@ -176,7 +190,8 @@ class CrepsSettings(KeepsPrograms):
         """
         policy = _checked_policy("policy", policy, self.policy_features)
         for field, values in policy._asdict().items():
-            checks.finite(f"policy.{field}", values, largest=checks.LARGEST)
+            # Coefficients are multiplied by features, which may be small; squares are taken of the spread.
+            checks.finite(f"policy.{field}", values, largest=_LARGEST[field])
         theta_dim = policy.coef.shape[1]
         self._check_archive_size(theta_dim)
         archive = empty_archive(
@@ -341,19 +356,19 @@ def creps(
     Args:
         policy_features: Features varphi(s) that the policy's mean is linear in.
         baseline_features: Features phi(s) whose expectations over the contexts are kept.
-        kl_bound: Largest relative entropy epsilon of one update, in nats. Nothing is compiled anew for
-            another one; where it is traced and not above zero, the policy is kept.
-        archive_size: Number L of the last samples that are learned from. At least two for each feature and
-            parameter; fewer are warned of.
+        kl_bound: Largest relative entropy epsilon of one update, in nats. Another value compiles nothing
+            anew. Inside `jit`, where it cannot be checked, a bound that is not above 0 keeps the policy.
+        archive_size: Number L of the last samples that are learned from. There should be two for each feature
+            and each parameter: `init` warns of fewer, and refuses less than one.
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale.
         m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's, goes wherever
             they lead; `bounded_ml()` keeps mean and covariance from moving too far at once.
         importance: Weigh archived samples by how likely they are today over how likely they were when drawn
             (`Importance()`); by default all count equally, as in the paper. The weights are those of samples
             that were drawn by `ask`.
-        significance: The p-value from which on the covariance stays as it is: below, it moves the share
-            `1 - p_value / significance` of the way to the fitted one. None moves it all the way whatever the
-            evidence, as in the paper, and loses the exploration to noise.
+        significance: Largest p-value, above 0 and at most 1, at which the covariance still moves. It moves
+            the fraction `1 - p_value / significance` of the way to the fitted one. None moves it all the way
+            whatever the evidence, as in the paper, and loses the exploration to noise.
 
     Returns:
         The algorithm, with the functions `init`, `ask`, `tell` and `mean`.
@@ -364,7 +379,7 @@ def creps(
     Source: Abdolmaleki et al. 2016, Section 3.1.
     """
     _check_settings(policy_features, baseline_features, ridge, significance)
-    checks.number("kl_bound", kl_bound, above=0.0)
+    kl_bound = _checked_kl_bound(kl_bound)
     checks.function("m_step", m_step, "(policy, samples, *, ridge, scale) -> policy")
     if m_step is bounded_ml:
         raise ValueError(
@@ -373,8 +388,7 @@ def creps(
     settings = CrepsSettings(
         policy_features=policy_features,
         baseline_features=baseline_features,
-        # Of one type, whatever kind of number it was: another type would be compiled for anew.
-        kl_bound=kl_bound if isinstance(kl_bound, jax.Array) else np.float32(kl_bound),
+        kl_bound=kl_bound,
         archive_size=archive_size,
         ridge=ridge,
         m_step=m_step,
@@ -448,10 +462,19 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
         num_valid=num_valid,
         is_updated=is_updated,
         p_value=p_value,
-        unsupported_loss=p_value * loss,
+        unsupported_loss=_share_by_chance(p_value, settings.significance) * loss,
         reward_rounding=jnp.minimum(resolution / jnp.where(spread > 0, spread, 1.0), 1.0),
     )
     return CrepsState(policy, state.archive, state.iteration + 1, history), info
+
+
+def _share_by_chance(p_value: Scalar, significance: float | int | None) -> Scalar:
+    """Return the factor that makes the loss of an update an unbiased estimate of what went by chance.
+
+    By chance p-values are uniform. Without a significance E[2 p] = 1; with one the covariance moves in
+    proportion to 1 - u, where u = p / significance, and E[3 u (1 - u)] = E[1 - u].
+    """
+    return 2.0 * p_value if significance is None else 3.0 * jnp.minimum(p_value / significance, 1.0)
 
 
 def _samples(settings: CrepsSettings, state: CrepsState) -> tuple[_Samples, PolicyHistory | None]:
@@ -564,8 +587,8 @@ def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.nd
     theta_dim, note = archive.batch.theta.shape[1], f" beside batch.reward {reward.shape}"
     context = checks.host_array("batch.context", batch.context, (num, context_dim), note=note)
     theta = checks.host_array("batch.theta", batch.theta, (num, theta_dim), note=note)
-    _warn_of_coarse_rewards(reward)
     eps = max(jnp.finfo(kind).eps for kind in (reward.dtype, _float_dtype(batch.reward, reward.dtype)))
+    _warn_of_coarse_rewards(reward, float(eps))
     reward, rest = split_reward(reward, dtype)
     # NumPy goes to the compiled program as it is: jax would not let NaN pass where it looks out for it.
     return Batch(*(_converted(each, dtype) for each in (context, theta, reward))), rest, np.float32(eps)
@@ -577,8 +600,11 @@ def _float_dtype(values: Any, otherwise: Any) -> Any:
     return dtype if jnp.issubdtype(dtype, jnp.floating) else otherwise
 
 
-def _warn_of_coarse_rewards(reward: Array | np.ndarray) -> None:
-    """Warn where rounding takes much of the differences of rewards, unless these are traced."""
+def _warn_of_coarse_rewards(reward: Array | np.ndarray, eps: float) -> None:
+    """Warn where rounding takes much of the differences of rewards, unless these are traced.
+
+    `eps` is the rounding of the format in which they were told.
+    """
     if isinstance(reward, Tracer):
         return
     values = np.asarray(reward)
@@ -586,11 +612,11 @@ def _warn_of_coarse_rewards(reward: Array | np.ndarray) -> None:
     if values.size == 0:
         return
     with np.errstate(over="ignore"):
-        step, spread = np.spacing(np.abs(values).max()), values.max() - values.min()
+        step, spread = eps * np.abs(values).max(), values.max() - values.min()
     if spread > 0 and _COARSE_REWARDS * spread < step:
         warnings.warn(
-            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where {values.dtype} "
-            f"has steps of {step:.3g}: tell rewards in float64, or without their common offset",
+            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where its format has steps "
+            f"of {step:.3g}: tell rewards in float64, or without their common offset",
             stacklevel=4,
         )
 
@@ -599,6 +625,12 @@ def _check_fitted(fitted: LinearGaussian, policy: LinearGaussian) -> None:
     checks.instance("what m_step returns", fitted, LinearGaussian)
     for field, values in policy._asdict().items():
         checks.array(f"{field} of what m_step returns", getattr(fitted, field), values.shape)
+
+
+def _checked_kl_bound(kl_bound: ScalarLike) -> ScalarLike:
+    """Return a bound of one type, whatever kind of number it was: for another type jax compiles anew."""
+    checks.number("kl_bound", kl_bound, above=0.0)
+    return kl_bound if isinstance(kl_bound, jax.Array) else np.float32(kl_bound)
 
 
 def _check_settings(

@@ -119,15 +119,16 @@ def solve_dual(
         valid: Which samples count; all by default. As numbers: how much each counts before its reward is
             seen, such as its importance weight. One whose reward or features are not finite never counts.
         kl_bound: Largest relative entropy epsilon between the weights and those of `valid`, above zero.
-        resolution: Size of the differences between rewards that are rounding; by default that of the largest
-            reward in the format that it was given in. For rewards less an offset it is that of the offset.
+        resolution: Differences between rewards up to this size, in the unit of the rewards, count as rounding
+            error; by default that of the largest reward in the format in which it was given. For rewards from
+            which an offset was subtracted it is the rounding error of the offset.
 
     Returns:
         The solution, finite for any number of samples that count, none included. Where the bound is active,
         the relative entropy of `sample_weights` equals it and they keep the mean of the features.
 
     Raises:
-        ValueError: If shapes do not fit or `kl_bound` is not a positive number.
+        ValueError: If shapes do not fit, `kl_bound` is not a positive number, or `resolution` is negative.
 
     Source: Abdolmaleki et al. 2016, Eq. 12 and 13.
     """

@@ -30,9 +30,10 @@ def independence_p_value(
 ) -> Scalar:
     """Test whether the weights of samples are independent of their parameters, given the context.
 
-    Three F-tests, of which the most significant counts, times three (Bonferroni): the change of the weights
-    is regressed on the parameters, on their squares, and on the sum of their squares. Parameters are whitened
-    after a regression on the features of the context.
+    Three tests, of which the most significant counts, times three (Bonferroni). Parameters are whitened
+    after a regression on the features of the context. Two F-tests regress the change of the weights on the
+    parameters and on their squares; a chi-squared test asks whether the samples that gain weight lie closer
+    to each other than all do. p-values far below 0.01 are approximate, as weights are not Gaussian.
 
     Args:
         weights: Weights d of the samples that follow from their rewards; they sum to one.
@@ -40,8 +41,8 @@ def independence_p_value(
             count. Their scale does not matter.
         features: Policy features of the contexts. Rows that do not count have to be finite.
         theta: Parameters, likewise, or what a policy has added to its mean: a linear function of features and
-            parameters tests the same. Of parameters that are nearly dependent on others or on the features,
-            with less than a hundredth of their spread left, only the others are tested.
+            parameters tests the same. A parameter is left out if the features and the parameters before it
+            explain all but about 1 % of its standard deviation (in float32).
 
     Returns:
         The p-value: how likely a dependence as strong as this one is where there is none. It is 1 where there
@@ -52,37 +53,35 @@ def independence_p_value(
     """
     prior = normalised(prior)
     change = jnp.where(prior > 0, weights - prior, 0.0)
-    noise, num_features, num_directions = _whitened_noise(prior, features, theta)
-    squares = noise**2
-    sums = jnp.sum(squares, axis=1, keepdims=True) - num_directions
+    white_features, noise, num_features, num_directions = _whitened(prior, features, theta)
     num_samples = 1.0 / jnp.maximum(jnp.sum(prior**2), jnp.finfo(prior.dtype).tiny)
     freedom = num_samples - num_features
-
     total = jnp.sum(change**2 / jnp.where(prior > 0, prior, 1.0))
-    of_noise = exact_dot(change, noise) ** 2
-    of_squares = _explained(change, prior, squares)
-    of_sums = _explained(change, prior, sums)
-    one = jnp.ones_like(num_directions)
+    squares = noise**2
     p_values = jnp.stack(
         [
-            _regression_p_value(of_noise, total, num_directions, freedom),
-            _regression_p_value(of_squares, total, num_directions, freedom),
-            # The size of whitened noise is constant where there are no more samples than directions.
-            _regression_p_value(of_sums, total, one, freedom - num_directions),
+            _regression_p_value(exact_dot(change, noise) ** 2, total, num_directions, freedom),
+            _regression_p_value(_explained(change, prior, squares), total, num_directions, freedom),
+            _concentration_p_value(change, prior, white_features, noise, num_features, num_directions),
         ]
     )
     return jnp.minimum(_NUM_TESTS * jnp.min(p_values), 1.0)
 
 
 def share_of_evidence(p_value: ScalarLike, significance: float) -> Scalar:
-    """Return how far the evidence lets the covariance move: 1 for a p-value of 0, 0 from `significance`."""
+    """Return the fraction of its way that the covariance may move, from 0 to 1.
+
+    Args:
+        p_value: From `independence_p_value`, from 0 to 1.
+        significance: The p-value, above 0, from which on it does not move.
+    """
     return jnp.clip(1.0 - p_value / significance, 0.0, 1.0)
 
 
 def blended_cov_chol(
     old: Float[Array, "d d"], new: Float[Array, "d d"], share: ScalarLike
 ) -> Float[Array, "d d"]:
-    """Return the Cholesky factor of `(1 - share) old old' + share new new'`, to the bit at 0 and 1.
+    """Return the Cholesky factor of `(1 - share) old old' + share new new'`, exactly if the share is 0 or 1.
 
     The relative entropy to the old covariance is convex in the new one: the blend keeps its bounds.
     """
@@ -95,11 +94,13 @@ def blended_cov_chol(
     return jnp.where(share >= 1.0, new, jnp.where(share <= 0.0, old, jnp.tril(exact_dot(old, factor))))
 
 
-def _whitened_noise(prior: Array, features: Array, theta: Array) -> tuple[Array, Scalar, Scalar]:
-    """Return what a regression on the features leaves of the parameters, whitened, and two numbers: of
-    independent features, a constant included, and of independent directions of the parameters.
+def _whitened(prior: Array, features: Array, theta: Array) -> tuple[Array, Array, Scalar, Scalar]:
+    """Regress the parameters on the features, and whiten both.
 
-    Columns that depend on others become zero.
+    Returns:
+        Whitened features; whitened residuals of the parameters; the number of independent features, a
+        constant included; the number of independent directions of the residuals. Columns that depend on
+        others are zero.
     """
     counts = (prior > 0)[:, None]
     columns = jnp.where(counts, jnp.concatenate([features, theta], axis=1), 0.0)
@@ -121,8 +122,13 @@ def _whitened_noise(prior: Array, features: Array, theta: Array) -> tuple[Array,
     white = jnp.where(is_independent[None, :], unit[:, None] * inverse, 0.0)
     num_features = features.shape[1]
     counts = is_independent.astype(prior.dtype)
-    noise = exact_dot(columns, white[:, num_features:])
-    return noise, 1.0 + jnp.sum(counts[:num_features]), jnp.sum(counts[num_features:])
+    white = exact_dot(columns, white)
+    return (
+        white[:, :num_features],
+        white[:, num_features:],
+        1.0 + jnp.sum(counts[:num_features]),
+        jnp.sum(counts[num_features:]),
+    )
 
 
 def _explained(change: Array, prior: Array, columns: Array) -> Array:
@@ -146,6 +152,51 @@ def _regression_p_value(explained: Array, total: Scalar, num_regressors: Scalar,
         r_squared, jnp.where(is_testable, num_regressors, 1.0), jnp.where(is_testable, rest, 1.0)
     )
     return jnp.where(is_testable, p_value, 1.0)
+
+
+def _concentration_p_value(
+    change: Array, prior: Array, features: Array, noise: Array, num_features: Scalar, num_directions: Scalar
+) -> Scalar:
+    """Return the p-value of the chi-squared test that the samples that gain weight are as spread as all.
+
+    Few samples that lie close to each other are evidence, which regressions on all samples hardly see.
+    """
+    gain = jnp.maximum(change, 0.0)
+    gain = gain / jnp.where(jnp.any(gain > 0), jnp.sum(gain), 1.0)
+    # What is left of them after a regression on the features, by the products of all columns.
+    columns = jnp.concatenate([jnp.ones_like(gain)[:, None], features, noise], axis=1)
+    products = exact_dot(columns.T, gain[:, None] * columns)
+    size = 1 + features.shape[1]
+    identity = jnp.eye(size, dtype=gain.dtype)
+    jitter = 10.0 * size * jnp.finfo(gain.dtype).eps * (1.0 + jnp.trace(products[:size, :size]))
+    factor = jnp.linalg.cholesky(products[:size, :size] + jitter * identity)
+    explained = solve_triangular(factor, products[:size, size:], lower=True)
+    spread = jnp.trace(products[size:, size:]) - jnp.sum(explained**2)
+
+    num_samples = 1.0 / jnp.maximum(jnp.sum(gain**2), jnp.finfo(gain.dtype).tiny)
+    rest = num_samples - num_features
+    sizes = jnp.sum(noise**2, axis=1)
+    variance = exact_dot(prior, (sizes - num_directions) ** 2)
+    # Sizes that vary more than those of a Gaussian say less: those of a mixture of policies do.
+    freedom = (
+        rest
+        * num_directions
+        * jnp.minimum(2.0 * num_directions / jnp.where(variance > 0, variance, 1.0), 1.0)
+    )
+    is_testable = (rest > 0.5) & (num_directions > 0) & jnp.any(gain > 0)
+    freedom = jnp.where(is_testable, freedom, 1.0)
+    ratio = jnp.maximum(spread, 0.0) / jnp.where(is_testable, num_directions * rest / num_samples, 1.0)
+    return jnp.where(is_testable, _chi_squared_cdf(ratio, freedom), 1.0)
+
+
+def _chi_squared_cdf(ratio: Array, freedom: Array) -> Scalar:
+    """Return the probability of a chi-squared number below `ratio` times its mean, by chance.
+
+    Source: Wilson and Hilferty 1931, The distribution of chi-square.
+    """
+    spread = 2.0 / (9.0 * freedom)
+    normal = (jnp.cbrt(ratio) - (1.0 - spread)) / jnp.sqrt(spread)
+    return 0.5 * erfc(-normal / math.sqrt(2.0))
 
 
 def _f_survival(r_squared: Array, num_regressors: Array, rest: Array) -> Scalar:

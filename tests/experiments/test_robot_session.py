@@ -146,7 +146,7 @@ def test_what_is_learned_is_what_the_algorithm_learns_of_these_batches(session):
             Batch(
                 jnp.array([[trial.context["distance"]] for trial in batch]),
                 jnp.array([trial.theta for trial in batch]),
-                jnp.array(rewards),
+                np.array(rewards),  # in float64, as the session tells them
             ),
         )
     updates = session.status().updates
