@@ -170,6 +170,8 @@ class CrepsSettings(KeepsPrograms):
 
     def algorithm(self) -> Creps:
         """Return the functions."""
+        # Now, while an algorithm that they may be shared with is alive: one that this one takes the place of.
+        _ = self.programs
         return Creps(self.init, self.ask, self.tell, self.mean)
 
     def init(self, policy: LinearGaussian) -> CrepsState:
@@ -587,8 +589,9 @@ def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.nd
     theta_dim, note = archive.batch.theta.shape[1], f" beside batch.reward {reward.shape}"
     context = checks.host_array("batch.context", batch.context, (num, context_dim), note=note)
     theta = checks.host_array("batch.theta", batch.theta, (num, theta_dim), note=note)
-    eps = max(jnp.finfo(kind).eps for kind in (reward.dtype, _float_dtype(batch.reward, reward.dtype)))
-    _warn_of_coarse_rewards(reward, float(eps))
+    told = max(reward.dtype, _float_dtype(batch.reward, reward.dtype), key=lambda kind: jnp.finfo(kind).eps)
+    eps = jnp.finfo(told).eps
+    _warn_of_coarse_rewards(reward, told)
     reward, rest = split_reward(reward, dtype)
     # NumPy goes to the compiled program as it is: jax would not let NaN pass where it looks out for it.
     return Batch(*(_converted(each, dtype) for each in (context, theta, reward))), rest, np.float32(eps)
@@ -600,10 +603,10 @@ def _float_dtype(values: Any, otherwise: Any) -> Any:
     return dtype if jnp.issubdtype(dtype, jnp.floating) else otherwise
 
 
-def _warn_of_coarse_rewards(reward: Array | np.ndarray, eps: float) -> None:
-    """Warn where rounding takes much of the differences of rewards, unless these are traced.
+def _warn_of_coarse_rewards(reward: Array | np.ndarray, told: Any) -> None:
+    """Warn where rounding to the format they were told in takes much of the differences of rewards.
 
-    `eps` is the rounding of the format in which they were told.
+    It is not known where they are traced.
     """
     if isinstance(reward, Tracer):
         return
@@ -612,11 +615,11 @@ def _warn_of_coarse_rewards(reward: Array | np.ndarray, eps: float) -> None:
     if values.size == 0:
         return
     with np.errstate(over="ignore"):
-        step, spread = eps * np.abs(values).max(), values.max() - values.min()
+        step, spread = float(jnp.finfo(told).eps) * np.abs(values).max(), values.max() - values.min()
     if spread > 0 and _COARSE_REWARDS * spread < step:
         warnings.warn(
-            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where its format has steps "
-            f"of {step:.3g}: tell rewards in float64, or without their common offset",
+            f"batch.reward has a spread of {spread:.3g} around {values[0]:.6g}, where {np.dtype(told)} "
+            f"has steps of {step:.3g}: tell rewards in float64, or without their common offset",
             stacklevel=4,
         )
 

@@ -256,7 +256,7 @@ def _program(algorithm: Creps, function: Callable, *static: Any) -> Callable:
     programs = algorithm.programs
     if (function, *static) not in programs:
         # A copy: the program must not keep alive the algorithm that keeps it.
-        copy = algorithm.with_kl_bound(np.float32(0))
+        copy = algorithm.with_kl_bound(np.float32(1))
 
         def program(kl_bound: ScalarLike, key: Array, state: CrepsState) -> Any:
             return function(*static, copy.with_kl_bound(kl_bound), key, state)

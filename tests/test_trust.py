@@ -260,6 +260,69 @@ def test_the_rounding_is_that_of_the_format_the_rewards_were_told_in(dtype):
         start = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), START)
         algorithm = creps(FEATURES, FEATURES, archive_size=NUM)
         given = jnp.asarray(rewards, dtype) if dtype in (jnp.bfloat16, jnp.float32) else rewards.astype(dtype)
-        _, info = algorithm.tell(algorithm.init(start), Batch(CONTEXTS, THETAS, given))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # bfloat16 is as coarse as this
+            _, info = algorithm.tell(algorithm.init(start), Batch(CONTEXTS, THETAS, given))
         expected = 1.75 * float(jnp.finfo(dtype).eps) * np.abs(rewards).max() / np.ptp(rewards)
         assert float(info.reward_rounding) == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_search_with_cubic_features_is_the_same_in_any_unit_of_the_context(unit):
+    def rollout(key, context, theta):
+        s = context[0] / unit
+        return PlainOutcome(-((theta[0] - s + 2.0 * s**3) ** 2), jnp.zeros(0))
+
+    features = polynomial_features(1, 3)
+    algorithm = creps(features, features, archive_size=100)
+    task = Task(uniform_contexts(-unit, unit), rollout, 1, 1, worst_reward=-100.0)
+    start = LinearGaussian(jnp.zeros((4, 1)), jnp.eye(1))
+    state, log = train(jax.random.key(3), task, algorithm, start, iterations=40, samples=20)
+    assert float(log.mean_reward[0]) < -0.5 and float(log.mean_reward[-1]) > -0.05
+    contexts = unit * jnp.linspace(-1.0, 1.0, 11)[:, None]
+    expected = contexts / unit - 2.0 * (contexts / unit) ** 3
+    np.testing.assert_allclose(algorithm.mean(state.policy, contexts), expected, atol=0.2)
+    algorithm.init(state.policy)  # what was learned is where the next search can begin
+
+
+def test_a_sweep_of_kl_bounds_through_train_compiles_once_and_is_that_of_the_numbers():
+    def rollout(key, context, theta):
+        return PlainOutcome(-jnp.sum((theta - context[0]) ** 2), jnp.zeros(0))
+
+    task = Task(uniform_contexts((0.0, 0.0), (1.0, 1.0)), rollout, 2, DIM, worst_reward=-100.0)
+
+    coefs, compilations = [], []
+    for kl_bound in (0.2, 0.7, jnp.float32(0.2), np.float64(0.7)):
+        # Each takes the place of the last one, which is then freed.
+        algorithm = creps(FEATURES, FEATURES, archive_size=44, kl_bound=kl_bound)
+        with count_compilations() as compiled:
+            state, _ = train(jax.random.key(0), task, algorithm, START, iterations=3, samples=20)
+        coefs.append(np.asarray(state.policy.coef))
+        compilations.append(len(compiled))
+    assert compilations[0] > 0 and not any(compilations[1:])
+    np.testing.assert_array_equal(coefs[2:], coefs[:2])
+    assert not np.array_equal(coefs[0], coefs[1])
+
+
+@pytest.mark.parametrize("bad", [-1.0, 0.0, float("nan"), "x"])
+def test_another_kl_bound_is_checked_as_the_first_one(bad):
+    with pytest.raises((ValueError, TypeError), match="kl_bound"):
+        ALGORITHM.with_kl_bound(bad)
+
+
+def test_equal_rewards_keep_the_policy_however_often_they_are_told():
+    state = ALGORITHM.init(START)
+    for _ in range(150):
+        chosen = RNG.integers(0, NUM, 7)
+        batch = Batch(CONTEXTS[chosen], THETAS[chosen], np.full(7, 3.3))
+        new, info = ALGORITHM.tell(state, batch)
+        assert_kept(state, new, info)
+        state = new
+    assert int(state.iteration) == 150
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_rewards_that_are_coarse_in_the_format_they_were_told_in_are_warned_of(dtype):
+    offset = {np.float16: 2e4, np.float32: 1e7}[dtype]
+    with pytest.warns(UserWarning, match="batch.reward has a spread of"):
+        tell((offset + 3.0 * REWARDS).astype(dtype))
