@@ -19,6 +19,8 @@ __all__ = ["blended_cov_chol", "independence_p_value", "share_of_evidence"]
 
 _LEAST_VARIANCE = 1e-4
 """Squares of whitened parameters, which have a variance of 2 if Gaussian, are constant below this one."""
+_ROUNDING = 64.0
+"""Spread of a column, in units of the rounding of its mean, that may be rounding of its sums."""
 _NUM_TESTS = 3
 
 
@@ -45,7 +47,7 @@ def independence_p_value(
             explain all but about 1 % of its standard deviation (in float32).
 
     Returns:
-        The p-value: how likely a dependence as strong as this one is where there is none. It is 1 where there
+        The p-value, how likely a dependence as strong as this one is where there is none. It is 1 where there
         are too few samples to test for it, no more than features and parameters, or where no weight differs
         from that of before.
 
@@ -112,7 +114,7 @@ def _whitened(prior: Array, features: Array, theta: Array) -> tuple[Array, Array
     products = exact_dot(columns.T, prior[:, None] * columns)
     eps, spread = jnp.finfo(columns.dtype).eps, safe_sqrt(jnp.diagonal(products))
     # What is constant up to rounding becomes zero; the others are scaled to a spread of one.
-    is_spread = spread > 4.0 * eps * jnp.abs(means)
+    is_spread = spread > _ROUNDING * eps * jnp.abs(means)
     unit = jnp.where(is_spread, 1.0 / jnp.where(is_spread, spread, 1.0), 0.0)
     # One factorisation regresses and whitens, as it frees each column of those before it.
     identity, rounding = jnp.eye(unit.size, dtype=unit.dtype), 4.0 * unit.size * eps

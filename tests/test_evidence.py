@@ -70,6 +70,19 @@ def test_neither_offsets_nor_means_that_follow_the_context_change_the_p_value(ke
     )
 
 
+@pytest.mark.parametrize("value", [1.0, 0.1, 3e7])
+@pytest.mark.parametrize("num", [10, 30, 1000])
+def test_a_constant_feature_is_no_further_one_however_weights_round(key, value, num):
+    features, theta, weights = samples(key, num, 3, 0.3)
+    constant = jnp.full((num, 1), value)
+    plain = independence_p_value(weights, jnp.ones(num), features[:, 1:], theta)
+    for noise in (0.0, 1e-7):
+        prior = 1.0 / num + noise * jax.random.uniform(key, (num,))
+        both = jnp.concatenate([constant, features[:, 1:]], axis=1)
+        for test in (independence_p_value, jax.jit(independence_p_value)):
+            np.testing.assert_allclose(test(weights, prior, both, theta), plain, rtol=0.02, atol=1e-9)
+
+
 @pytest.mark.parametrize("spread", [1e-1, 1e-3, 1e-6, 0.0])
 def test_nearly_dependent_parameters_leave_the_others_to_be_tested(key, spread):
     features, theta, weights = samples(key, 200, 3, 1.0)
