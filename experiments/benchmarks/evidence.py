@@ -1,16 +1,21 @@
 """Measure what a search does without evidence, and with rare evidence.
 
     python -m experiments.benchmarks.evidence [--trials 8] [--searches 40]
+    python -m experiments.benchmarks.evidence --trade-off FILE.png
 
 Pure noise: rewards that have nothing to do with the parameters, 2 contexts, affine features. The spread of
 the policy should stay; it is printed as the logarithm of what is left of it, for several lengths of the
 archive, with and without the test on evidence. Sparse: a reward of 1 for hits, which the first policy has by
-chance in 0.4 % of its episodes, and 0 otherwise.
+chance in 0.4 % of its episodes, and 0 otherwise. Trade-off: what the evidence that is asked for
+(`significance`) costs on test functions and saves in noise, as a figure.
 """
 
 from experiments.process import prepare
 
 prepare()
+
+import dataclasses  # noqa: E402
+from pathlib import Path  # noqa: E402
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -24,7 +29,9 @@ from creps_jax.mstep import bounded_ml, weighted_ml  # noqa: E402
 from creps_jax.policy import LinearGaussian  # noqa: E402
 from creps_jax.tasks import PlainOutcome, Task  # noqa: E402
 from creps_jax.train import train_trials  # noqa: E402
-from experiments import tables  # noqa: E402
+from experiments import plots, tables, updates  # noqa: E402
+from experiments.comparison import LearnerSettings, compare, mean_policy_curve  # noqa: E402
+from experiments.results import save_figure  # noqa: E402
 
 M_STEPS = {"weighted ML": weighted_ml, "bounded": bounded_ml()}
 NOISE = ((10, 20, 3_000, (60, 100, 200)), (20, 50, 10_000, (200,)))
@@ -32,15 +39,21 @@ NOISE = ((10, 20, 3_000, (60, 100, 200)), (20, 50, 10_000, (200,)))
 SIGNIFICANCES = {"default": 0.1, "no test": None}
 SPARSE_ARCHIVE, SPARSE_SAMPLES, SPARSE_EPISODES = 200, 20, 3_000
 HIT_RADIUS = 0.17
+LEVELS = (0.02, 0.05, 0.1, 0.2, 0.5, None)
+TRADED = ("sphere", "ellipsoid", "rastrigin", "ackley", "sinus")
 
 
-def main(trials: int = 8, searches: int = 40) -> None:
+def main(trials: int = 8, searches: int = 40, trade_off: Path | None = None) -> None:
     """Measure, and print a table for each.
 
     Args:
         trials: Searches in pure noise, for each row.
         searches: Searches for the sparse reward.
+        trade_off: Measure and draw what `significance` costs and saves instead, into this file.
     """
+    if trade_off is not None:
+        draw_trade_off(measure_trade_off(), trade_off)
+        return
     print("Pure noise: log(spread after / before), mean of the parameters; mean (least) of the trials")
     for fit in M_STEPS:
         for dim, samples, episodes, archives in NOISE:
@@ -54,6 +67,43 @@ def main(trials: int = 8, searches: int = 40) -> None:
     print(
         tables.to_markdown({"fit": list(M_STEPS), "solved": [f"{solved(f, searches):.0%}" for f in M_STEPS]})
     )
+
+
+def measure_trade_off(trials: int = 20) -> dict[str, np.ndarray]:
+    """Return, for each of `LEVELS`, rows of trials: what noise leaves of the spread, and last rewards."""
+    rows: dict[str, list[np.ndarray]] = {}
+    plan = LearnerSettings(iterations=200, trials=trials, samples=50)
+    setup_key, learn_key = jax.random.split(jax.random.key(0))
+    for level in LEVELS:
+        for fit in M_STEPS:
+            spread = log_spread(fit, 20, 50, 10_000, 200, trials, level)
+            rows.setdefault(f"pure noise, {fit}", []).append(spread)
+        for name in TRADED:
+            bench = updates.BENCHES[name](setup_key, plan)
+            bounded = bench.contenders["bounded"]
+            settings = bounded.algorithm.settings
+            assert settings is not None
+            algorithm = dataclasses.replace(settings, significance=level).algorithm()
+            found = compare({name: bounded._replace(algorithm=algorithm)}, plan, learn_key, grid=bench.grid)
+            rows.setdefault(name, []).append(mean_policy_curve(found, name)[1][:, -1])
+        found = ", ".join(f"{name} {updates.median_and_interval(row[-1])}" for name, row in rows.items())
+        print(f"significance {level}: {found}", flush=True)
+    return {name: np.stack(row) for name, row in rows.items()}
+
+
+def draw_trade_off(rows: dict[str, np.ndarray], path: Path) -> None:
+    """Draw medians and quartiles over `LEVELS`."""
+    figure, axes = plots.new_figure(2, 4, width=11.0, height=5.0)
+    panels = axes.flat
+    for panel, (name, row) in zip(panels, rows.items(), strict=False):
+        low, middle, high = np.percentile(row, (25, 50, 75), axis=1)
+        panel.errorbar(range(len(LEVELS)), middle, (middle - low, high - middle), marker="o", capsize=3)
+        panel.set(title=name, xlabel="significance")
+        panel.set_xticks(range(len(LEVELS)), ["none" if x is None else f"{x:g}" for x in LEVELS])
+        panel.set_ylabel("log of the spread that is left" if name.startswith("pure noise") else "mean reward")
+    for panel in panels[len(rows) :]:
+        panel.set_axis_off()
+    save_figure(path, figure)
 
 
 def log_spread(
