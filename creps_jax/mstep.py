@@ -14,15 +14,13 @@ import jax.numpy as jnp
 from jax import lax
 
 from creps_jax import checks
-from creps_jax.linalg import divided, exact_dot
+from creps_jax.linalg import divided, exact_dot, safe_sqrt
 from creps_jax.policy import LinearGaussian, fit_weighted_ml
-from creps_jax.regression import Regression, as_coefficients, coordinates, gauge, normaliser, regress
+from creps_jax.regression import Regression, as_coefficients, coordinates, normaliser, regress
 from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
 
 __all__ = ["MStep", "WeightedSamples", "bounded_ml", "weighted_ml"]
 
-_LEAST_EXCITATION = 3e-5
-"""Size, for features of mean square one, below which a direction counts as that large in the bound."""
 _LOG_MULTIPLIERS = (-12.0, 40.0)
 """Range of the logarithms of the multipliers: below, a bound changes nothing; above, nothing moves."""
 _NUM_TRIALS, _NUM_REFINEMENTS = 32, 4
@@ -70,9 +68,10 @@ def bounded_ml(
     used up by the covariance, which few samples know least about, and end the search early; so does the
     joint optimum, measured on the contextual sphere.
 
-    The mean that is likeliest within its bound, at the old covariance, is, in features that are uncorrelated
-    over the contexts and along the eigenvectors of their weighted mean square g, a share `g / (g + l)` of
-    the whole way, with a multiplier l. The whole way is that of `weighted_ml`, with its ridge. The covariance
+    The mean that is likeliest within its bound, at the old covariance, is a share `g / (g + l c)` of the
+    whole way, with a multiplier l, in features that are uncorrelated both over the contexts, with a mean
+    square c, and over the weighted samples, with a mean square g that counts the ridge. The whole way is that
+    of `weighted_ml`. The covariance
     that is likeliest within its bounds is, along the eigenvectors of the weighted covariance s (made
     unbiased, as in `fit_weighted_ml`), the root x of `l x^2 - (l + m - 1) x - s = 0`, where m is the
     multiplier of the bound on the loss of entropy. No spread falls below the rounding of theta.
@@ -142,46 +141,41 @@ def _bounded_change(
     Returns:
         The change in the coordinates of the regression, and the normaliser of its residuals.
     """
-    basis = _uncorrelated(fit, samples)
-    rows = divided(fit.rows, basis)
-    mean_square, axes = jnp.linalg.eigh(exact_dot(rows.T, rows))
-    mean_square = jnp.maximum(mean_square, 0.0)
+    contexts = _context_rows(fit, samples)
+    # Both what holds the likeliest mean and what the bound is on can be tiny in a direction, as that of a
+    # radial basis function beyond all contexts; with the ridge in the first, their sum is not.
+    basis = jnp.linalg.qr(jnp.concatenate([fit.root, contexts]), mode="r")
+    held, contexts, rows = (divided(columns, basis) for columns in (fit.root, contexts, fit.rows))
+    _, axes = jnp.linalg.eigh(exact_dot(contexts.T, contexts))
+    hold, use = (jnp.sum(exact_dot(columns, axes) ** 2, axis=0) for columns in (held, contexts))
     # The whole way: in units of the old covariance, for features along the axes.
     change = fit.solution.at[0].add(fit.centre)
     change = jax.scipy.linalg.solve_triangular(old_chol, change.T, lower=True).T
     way = exact_dot(axes.T, exact_dot(basis, change))
-    squares = 0.5 * jnp.sum(way**2, axis=1)
+    squares = 0.5 * use * jnp.sum(way**2, axis=1)
 
     def share(multiplier: Array) -> Array:
-        return mean_square / (mean_square + multiplier)
+        return hold / (hold + multiplier * use)
 
     def kl(multiplier: Array) -> Array:
         return jnp.sum(share(multiplier) ** 2 * squares)
 
     multiplier = _least_multiplier(kl, kl_bound, way.dtype)
-    shares = share(multiplier)
-    moved = exact_dot(axes, shares[:, None] * way)
+    moved = exact_dot(axes, share(multiplier)[:, None] * way)
     moved = exact_dot(jax.scipy.linalg.solve_triangular(basis, moved), old_chol.T)
-    # A share s of a fitted feature uses 2 s - s^2 of the scatter that the whole of it does.
+    # The mean is linear in theta, and so are the residuals: what they have lost of the scatter of theta.
+    rows = exact_dot(rows, axes) / safe_sqrt(hold + multiplier * use)[None, :]
     counted = exact_dot(rows.T, fit.weights[:, None] * rows)
-    counted = jnp.sum(axes * exact_dot(counted, axes), axis=0)
-    used = jnp.sum((2.0 - shares) * counted / (mean_square + multiplier))
+    used = 2.0 * jnp.trace(counted) - jnp.sum(counted * exact_dot(rows.T, rows))
     return moved, normaliser(used, rows.shape[1])
 
 
-def _uncorrelated(fit: Regression, samples: WeightedSamples) -> Float[Array, "q q"]:
-    """Return the upper triangular matrix for which coordinates are it times features of mean square I.
-
-    The mean is that over the contexts that count.
-    """
+def _context_rows(fit: Regression, samples: WeightedSamples) -> Float[Array, "n q"]:
+    """Return coordinates whose sums of squares are means over the contexts that count."""
     counts = samples.is_valid & jnp.all(jnp.isfinite(samples.features), axis=1)
     rows = coordinates(fit.basis, jnp.where(counts[:, None], samples.features, 0.0))
     num = jnp.maximum(jnp.sum(counts, dtype=rows.dtype), 1.0)
-    rows = jnp.where(counts[:, None], rows, 0.0) / jnp.sqrt(num)
-    size = jnp.linalg.norm(rows, axis=0)
-    floor = _LEAST_EXCITATION * jnp.diag(jnp.asarray(jnp.where(size > 0, size, 1.0)))
-    floor = floor + jnp.pad(gauge(fit.basis), ((1, 0), (1, 0)))
-    return jnp.linalg.qr(jnp.concatenate([rows, floor]), mode="r")
+    return jnp.where(counts[:, None], rows, 0.0) / jnp.sqrt(num)
 
 
 def _bounded_factor(

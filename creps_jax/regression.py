@@ -15,7 +15,7 @@ from creps_jax import checks
 from creps_jax.linalg import exact_dot, normalised, safe_norm, safe_sqrt, weighted_mean, weighted_ridge
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["Basis", "Regression", "as_coefficients", "coordinates", "gauge", "normaliser", "regress"]
+__all__ = ["Basis", "Regression", "as_coefficients", "coordinates", "normaliser", "regress"]
 
 _ROUNDING = 2.0
 """Spread of a feature, in units of its rounding, that may be rounding."""
@@ -61,6 +61,8 @@ class Regression(NamedTuple):
     """What is left of theta without the start and the centre."""
     solution: Float[Array, "q d"]
     """The regression of `rest`, in coordinates."""
+    root: Float[Array, "q q"]
+    """The root, upper triangular, of what holds the solution: of `X' D X` and the ridge."""
     normaliser: Scalar
     """Expected scatter of the residuals, for a variance of one."""
 
@@ -105,7 +107,8 @@ def regress(
     # but for what the ridge adds: with it, Q' Q = I - T' T for the rows T of Q that belong to the penalty.
     counted = exact_dot(orthogonal.T, weights[:, None] * orthogonal)
     used = jnp.trace(counted) + jnp.sum(exact_dot(of_penalty, counted) * of_penalty)
-    return Regression(basis, rows, weights, size, centre, rest, solution, normaliser(used, rows.shape[1]))
+    Z = normaliser(used, rows.shape[1])
+    return Regression(basis, rows, weights, size, centre, rest, solution, triangular, Z)
 
 
 def coordinates(basis: Basis, features: Float[Array, "n p"]) -> Float[Array, "n q"]:
@@ -127,7 +130,7 @@ def as_coefficients(
     return jnp.clip(coef * _ratio(size[None, :], basis.unit[:, None]), -largest, largest)
 
 
-def gauge(basis: Basis) -> Float[Array, "p p"]:
+def _gauge(basis: Basis) -> Float[Array, "p p"]:
     """Return the projection of slopes on the constant, along which they change nothing."""
     size = safe_norm(basis.constant)
     direction = basis.constant / jnp.where(size > 0, size, 1.0)
@@ -219,7 +222,7 @@ def _penalty(basis: Basis, rows: Float[Array, "n q"], damping: Scalar) -> Float[
     changes nothing, and is held at zero.
     """
     num = rows.shape[1]
-    along, identity = gauge(basis), jnp.eye(num - 1, dtype=rows.dtype)
+    along, identity = _gauge(basis), jnp.eye(num - 1, dtype=rows.dtype)
     least = 4.0 * num**0.5 * jnp.finfo(rows.dtype).eps
     size = lax.stop_gradient(jnp.maximum(safe_sqrt(jnp.sum(rows**2, axis=0)), 1.0))
     slopes = jnp.pad(damping * (identity - along) + along, ((1, 0), (1, 0)))

@@ -9,6 +9,7 @@ import pytest
 from scipy import optimize
 
 from creps_jax import policy as gaussian
+from creps_jax.features import rbf_features
 from creps_jax.mstep import WeightedSamples, bounded_ml, weighted_ml
 from creps_jax.policy import LinearGaussian
 
@@ -224,6 +225,28 @@ def test_bounds_hold_for_one_sample_with_all_the_weight_and_for_samples_far_away
     new = bounded_ml(mean_kl_bound=0.1, cov_kl_bound=0.05)(policy, alone, ridge=RIDGE)
     mean, cov = parts(new, policy, alone)
     assert mean <= 0.1 * 1.01 and cov <= 0.05 * 1.01
+
+
+@pytest.mark.parametrize("high", [0.9, 0.8, 0.6])
+@pytest.mark.parametrize("mean_kl_bound", [1.0, 0.1, 1e-3])
+@pytest.mark.parametrize("x64", [False, True])
+def test_where_no_context_has_been_the_mean_moves_no_farther_than_without_a_bound(
+    key, high, mean_kl_bound, x64
+):
+    """The bound does not see these contexts: only the ridge holds the radial basis functions there."""
+    with jax.enable_x64(x64):
+        features = rbf_features(0.0, 1.0, 20)
+        scale = jnp.asarray(features.scale)
+        keys = jax.random.split(key, 3)
+        contexts = jax.random.uniform(keys[0], (60, 1), maxval=high)
+        old = LinearGaussian(jnp.zeros((20, 2)), jnp.eye(2))
+        theta = jax.random.normal(keys[1], (60, 2))
+        weights = jax.nn.softmax(-jnp.sum((theta - contexts) ** 2, axis=1))
+        samples = WeightedSamples(jax.vmap(features.apply)(contexts), theta, weights, jnp.ones(60, bool))
+        free = weighted_ml(old, samples, ridge=1e-4, scale=scale)
+        bounded = bounded_ml(mean_kl_bound=mean_kl_bound)(old, samples, ridge=1e-4, scale=scale)
+        assert np.abs(bounded.coef).max() < 1.2 * np.abs(free.coef).max()
+        assert parts(bounded, old, samples)[0] < 1.01 * mean_kl_bound
 
 
 def test_a_covariance_does_not_shrink_to_nothing_nor_without_samples(key):
