@@ -185,7 +185,8 @@ class CrepsSettings(KeepsPrograms):
 
         Raises:
             ValueError: If the policy does not fit the features, is not finite, or `cov_chol` is no Cholesky
-                factor; or if the archive has fewer samples than the policy has features and parameters.
+                factor; or if the archive has fewer samples than the policy has features and parameters, or no
+                more than there are baseline features.
 
         Warns:
             UserWarning: If the archive is too small for fits that can be trusted.
@@ -274,18 +275,23 @@ class CrepsSettings(KeepsPrograms):
         return found
 
     def _check_archive_size(self, theta_dim: int) -> None:
-        num_fitted = self.policy_features.size + theta_dim
+        num_fitted, num_baseline = self.policy_features.size + theta_dim, self.baseline_features.size
         if self.archive_size < num_fitted:
             raise ValueError(
                 f"archive_size must be at least {num_fitted}, features and parameters, "
                 f"got {self.archive_size}"
             )
-        enough = _ENOUGH_SAMPLES * num_fitted
+        if self.archive_size <= num_baseline:
+            raise ValueError(
+                f"archive_size must be at least {num_baseline + 1}, one more than baseline features, which "
+                f"would explain all rewards, got {self.archive_size}"
+            )
+        enough = _ENOUGH_SAMPLES * max(num_fitted, num_baseline)
         if self.archive_size < enough:
             warnings.warn(
                 f"archive_size should be at least {enough}, {_ENOUGH_SAMPLES} samples for each of "
-                f"{self.policy_features.size} features and {theta_dim} parameters, got {self.archive_size}: "
-                "the covariance will hardly move, or move by chance",
+                f"{self.policy_features.size} features and {theta_dim} parameters, or of {num_baseline} "
+                f"baseline features, got {self.archive_size}: the policy will hardly move, or move by chance",
                 stacklevel=3,
             )
 
@@ -361,7 +367,8 @@ def creps(
         kl_bound: Largest relative entropy epsilon of one update, in nats. Another value compiles nothing
             anew. Inside `jit`, where it cannot be checked, a bound that is not above 0 keeps the policy.
         archive_size: Number L of the last samples that are learned from. There should be two for each feature
-            and each parameter: `init` warns of fewer, and refuses less than one.
+            and each parameter, and two for each baseline feature: `init` warns of fewer, and refuses less
+            than one, or as few as could all be explained by the baseline.
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale.
         m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's, goes wherever
             they lead; `bounded_ml()` keeps mean and covariance from moving too far at once.
@@ -456,7 +463,7 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
     spread = jnp.max(jnp.abs(reward))
     info = CrepsInfo(
         dual=dual,
-        kl=sample_kl(weights, prior),
+        kl=jnp.maximum(sample_kl(weights, prior), 0.0),
         policy_kl=jnp.where(is_updated, _mean_kl(policy, state.policy, features, is_valid), 0.0),
         effective_samples=_effective_samples(weights),
         prior_effective_samples=_effective_samples(prior),
@@ -633,7 +640,7 @@ def _check_fitted(fitted: LinearGaussian, policy: LinearGaussian) -> None:
 def _checked_kl_bound(kl_bound: ScalarLike) -> ScalarLike:
     """Return a bound of one type, whatever kind of number it was: for another type jax compiles anew."""
     checks.number("kl_bound", kl_bound, above=0.0)
-    return kl_bound if isinstance(kl_bound, jax.Array) else np.float32(kl_bound)
+    return kl_bound if isinstance(kl_bound, Tracer) else np.float32(kl_bound)
 
 
 def _check_settings(

@@ -74,7 +74,7 @@ def bounded_ml(
     of `weighted_ml`. The covariance
     that is likeliest within its bounds is, along the eigenvectors of the weighted covariance s (made
     unbiased, as in `fit_weighted_ml`), the root x of `l x^2 - (l + m - 1) x - s = 0`, where m is the
-    multiplier of the bound on the loss of entropy. No spread falls below the rounding of theta.
+    multiplier of the bound on the loss of entropy. No spread falls to below the rounding of theta.
 
     Args:
         mean_kl_bound: Largest part of the mean in the relative entropy, nats.
@@ -128,7 +128,7 @@ class BoundedML:
         residual = divided(residual, old_chol.T)
         scatter = exact_dot(residual.T, residual) / unbiased  # Eq. 15
         factor = _bounded_factor(scatter, self.cov_kl_bound, self.entropy_loss_bound)
-        cov_chol = fit.size[:, None] * _as_cov_chol(exact_dot(old_chol, factor))
+        cov_chol = fit.size[:, None] * _as_cov_chol(exact_dot(old_chol, factor), old_chol)
         cov_chol = jnp.where(jnp.any(fit.weights > 0), cov_chol, policy.cov_chol)
         return LinearGaussian(policy.coef + as_coefficients(fit.basis, change, fit.size), cov_chol)
 
@@ -210,12 +210,13 @@ def _bounded_factor(
     return axes * jnp.sqrt(x)[None, :]
 
 
-def _as_cov_chol(root: Float[Array, "d d"]) -> Float[Array, "d d"]:
+def _as_cov_chol(root: Float[Array, "d d"], old_chol: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """Return the Cholesky factor of a covariance whose root is given, for parameters of size one."""
     upper = jnp.linalg.qr(root.T, mode="r")
     cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
-    # Below the rounding of theta a spread means nothing, and would shrink to zero.
-    least = 4.0 * jnp.finfo(cov_chol.dtype).eps
+    # Below the rounding of theta a spread means nothing, and would shrink to zero. One that has begun there
+    # may stay: to raise it would break the bounds.
+    least = jnp.minimum(4.0 * jnp.finfo(cov_chol.dtype).eps, jnp.linalg.norm(old_chol, axis=1))
     return cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]
 
 

@@ -40,7 +40,7 @@ def device_tuple(devices: Devices) -> ChosenDevices:
     Where there is only one local device, None chooses nothing: arrays stay where they are.
 
     Raises:
-        ValueError: If there is no device, or something else among them.
+        ValueError: If there is no device, or something else among them, or one of them twice.
     """
     if devices is None:
         local = tuple(jax.local_devices())
@@ -48,6 +48,8 @@ def device_tuple(devices: Devices) -> ChosenDevices:
     given = tuple(devices) if isinstance(devices, Iterable) else ()
     if not given or not all(isinstance(device, jax.Device) for device in given):
         raise ValueError(f"devices must be one device or more, as jax.devices() has them, got {devices!r}")
+    if len(set(given)) < len(given):
+        raise ValueError(f"devices must be given once each, got {devices!r}")
     return given
 
 

@@ -249,6 +249,16 @@ def test_where_no_context_has_been_the_mean_moves_no_farther_than_without_a_boun
         assert parts(bounded, old, samples)[0] < 1.01 * mean_kl_bound
 
 
+@pytest.mark.parametrize(("mean", "spread"), [(1e6, 0.1), (1e5, 0.01), (1.0, 1e-9)])
+def test_bounds_hold_for_a_spread_below_the_rounding_of_theta(key, mean, spread):
+    theta = jnp.float32(mean) + spread * jax.random.normal(key, (50, 1))
+    samples = WeightedSamples(jnp.ones((50, 1)), theta, jnp.full(50, 0.02), jnp.ones(50, bool))
+    old = LinearGaussian(jnp.full((1, 1), mean), jnp.full((1, 1), spread))
+    new = bounded_ml(mean_kl_bound=1.0, cov_kl_bound=0.05)(old, samples, ridge=1e-4)
+    mean_part, cov_part = parts(new, old, samples)
+    assert mean_part < 1.01 and cov_part < 0.051
+
+
 def test_a_covariance_does_not_shrink_to_nothing_nor_without_samples(key):
     policy, samples = make_problem(key)
     same = samples._replace(theta=jnp.ones((60, 4)))

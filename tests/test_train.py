@@ -274,6 +274,7 @@ def test_evaluation_gives_failed_rollouts_the_worst_reward(key):
         ({"samples": 0}, "samples must be at least 1, got 0"),
         ({"first_samples": -5}, "first_samples must be at least 1, got -5"),
         ({"devices": []}, r"devices must be one device or more, .* got \[\]"),
+        ({"devices": 2 * jax.devices()[:1]}, "devices must be given once each, got"),
         (
             {"start": LinearGaussian(np.zeros((2, 3)), np.eye(3))},
             r"the task's 2 parameters, got coef of shape \(2, 3\)",

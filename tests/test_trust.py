@@ -148,7 +148,7 @@ def test_a_traced_bound_that_is_none_keeps_the_policy(kl_bound):
 
     batch = Batch(*map(jnp.float32, (CONTEXTS, THETAS, REWARDS)))
     state, new, info = update(jnp.float32(kl_bound), batch)
-    assert not info.is_updated and all_finite((new, info))
+    assert not info.is_updated and all_finite((new, info)) and info.kl >= 0.0
     np.testing.assert_array_equal(new.policy.coef, state.policy.coef)
 
 
@@ -162,6 +162,20 @@ def test_an_archive_that_is_too_small_is_warned_of_with_the_number_that_would_do
     small = creps(FEATURES, FEATURES, archive_size=10)
     with pytest.warns(UserWarning, match="archive_size should be at least 12.*got 10"):
         small.init(START)
+
+
+@pytest.mark.parametrize(("num_centers", "archive_size"), [(6, 30), (6, 36)])
+def test_a_baseline_that_could_explain_all_of_the_archive_is_refused(num_centers, archive_size):
+    baseline = rbf_features((0.0, 0.0), (1.0, 1.0), num_centers)
+    algorithm = creps(FEATURES, baseline, archive_size=archive_size)
+    with pytest.raises(ValueError, match=f"at least 37, one more than baseline.*got {archive_size}"):
+        algorithm.init(START)
+
+
+def test_a_large_baseline_is_warned_of_with_the_number_that_would_do():
+    algorithm = creps(FEATURES, rbf_features((0.0, 0.0), (1.0, 1.0), 6), archive_size=60)
+    with pytest.warns(UserWarning, match="archive_size should be at least 72.*36 baseline features, got 60"):
+        algorithm.init(START)
 
 
 @pytest.mark.parametrize("field", Batch._fields)

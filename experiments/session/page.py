@@ -18,7 +18,11 @@ _BEFORE, _NOW = plots.PAPER_COLOUR, plots.COLOURS[0]
 _MAX_COLUMNS = 5
 
 _MUCH_LOST = 0.5
-"""Entropy lost by chance, in nats, from which on the page warns of it."""
+"""Entropy of a parameter lost by chance, in nats, and its share of all that is lost, from which on the page
+warns of it."""
+
+_MANY_UPDATES, _CHANCE = 5, 0.1
+"""Updates in a row whose p-values are all above this one, from which on the page warns of it."""
 
 
 def save_page(folder: Path, status: Status) -> None:
@@ -49,11 +53,28 @@ def summary(status: Status) -> list[str]:
             f"an update needs {status.least_trials} trials that are not broken, whose rewards "
             "differ by more than the context explains"
         )
-    lost = sum(update.unsupported_loss for update in updates)
-    if lost > _MUCH_LOST:
+    if updates:
+        lines += _warnings(status)
+    return lines
+
+
+def _warnings(status: Status) -> list[str]:
+    """Warn of a search that goes by chance."""
+    updates, lines = status.updates, []
+    lost, all_lost = (
+        sum(update.unsupported_loss for update in updates),
+        updates[0].entropy - updates[-1].entropy,
+    )
+    if lost > _MUCH_LOST * max(len(status.settings.parameters), all_lost):
         lines.append(
             f"exploration went without evidence: {lost:.2f} nats of entropy; more trials in a batch or a "
             "larger archive_size help"
+        )
+    last = updates[-_MANY_UPDATES:]
+    if len(last) == _MANY_UPDATES and all(update.p_value > _CHANCE for update in last):
+        lines.append(
+            f"the last {len(last)} batches gave no evidence that rewards depend on the parameters (p above "
+            f"{_CHANCE:g}): a larger archive_size, fewer features or less noise may help"
         )
     return lines
 

@@ -63,10 +63,14 @@ class Parameter(Context):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FeatureSettings:
-    """The features of the policy: the fields of `experiments.policy_file.Features`."""
+    """The features of the policy: the fields of `experiments.policy_file.Features`.
+
+    By default there are 5 centres for one context variable, for two 3 along each, and 2 for more: a session
+    has few trials, and 25 centres learn nothing from fifty.
+    """
 
     kind: str = "rbf"
-    num_centers: int = 5
+    num_centers: int | None = None
     bandwidth: float | None = None
 
 

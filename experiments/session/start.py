@@ -49,11 +49,15 @@ def settings_from_policy(saved: SavedPolicy, *, exploration: float = 1.0) -> Set
 
 
 def complete(settings: Settings) -> Settings:
-    """Fill in what a definition may leave open: where the search begins, and how many trials are kept.
+    """Fill in what a definition may leave open: features, where the search begins, how many trials are kept.
 
     Raises:
         UserError: if there are no such features.
     """
+    if settings.features.num_centers is None:
+        num_centers = {1: 5, 2: 3}.get(len(settings.contexts), 2)
+        features = dataclasses.replace(settings.features, num_centers=num_centers)
+        settings = dataclasses.replace(settings, features=features)
     if settings.archive_size is None:
         # An update needs as many trials as there are features and parameters.
         least = feature_map(settings).size + len(settings.parameters)

@@ -27,6 +27,7 @@ from experiments.cli import main
 from experiments.errors import UserError
 from experiments.policy_file import Features, SavedPolicy, load_policy, save_policy
 from experiments.session import RobotSession, page, plain, robot_session, storage
+from experiments.session.learner import Update
 from experiments.session.settings import load_settings
 from experiments.session.trials import Record, Trial
 
@@ -576,3 +577,35 @@ def test_the_page_shows_a_session_without_trials_and_one_of_two_contexts(session
     )
     assert len(page.draw(two.status()).axes) == 2
     assert len(page.draw(session.status()).axes) == 4
+
+
+@pytest.mark.parametrize(
+    ("changes", "warnings"),
+    [
+        ({}, []),
+        # Much was lost by chance, as much as was lost in all, or little of what was lost.
+        ({"unsupported_loss": 1.0, "entropies": (0.0, -6.0)}, ["exploration went without evidence: 6.00"]),
+        ({"unsupported_loss": 1.0, "entropies": (0.0, -60.0)}, []),
+        ({"p_value": 0.5}, ["the last 5 batches gave no evidence"]),
+    ],
+)
+def test_the_page_warns_of_a_search_that_goes_by_chance(session, changes, warnings):
+    entropies = np.linspace(*changes.pop("entropies", (0.0, -1.0)), 6)
+    update = dict.fromkeys(Update._fields, 0.0) | {"policy": None, "is_updated": True, "p_value": 0.001}
+    updates = tuple(Update(**{**update, **changes, "entropy": entropy}) for entropy in entropies)
+    lines = page.summary(session.status()._replace(updates=updates))
+    found = [line for line in lines if "evidence" in line]
+    assert len(found) == len(warnings)
+    for line, warning in zip(found, warnings, strict=True):
+        assert line.startswith(warning)
+
+
+@pytest.mark.parametrize(
+    ("num_contexts", "num_centers", "archive_size"), [(1, 5, 50), (2, 3, 50), (3, 2, 50)]
+)
+def test_more_contexts_have_fewer_centres_along_each(tmp_path, num_contexts, num_centers, archive_size):
+    contexts = [{"name": f"c{i}", "low": 0.0, "high": 1.0} for i in range(num_contexts)]
+    define = {"contexts": contexts, "parameters": [{"name": "x", "low": -5.0, "high": 5.0}]}
+    settings = RobotSession.create(tmp_path / "arm", define=define).status().settings
+    assert settings.features.num_centers == num_centers
+    assert settings.archive_size == archive_size
