@@ -211,13 +211,17 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
 
     Returns:
         Arrays of the learning (trials, iterations), the policies, their parameters over the speeds
-        (trials, n, d) and the evaluation (trials, n, seeds).
+        (trials, n, d), the evaluation (trials, n, seeds), and `trial_reward` (trials,), by which the policy
+        that is kept is chosen: the mean over the same speeds in the noise of learning.
     """
     if settings.constraint != "sigmoid":
         raise UserError(f"a policy is only kept with the constraint sigmoid, got {settings.constraint!r}")
     evaluate_key, learn_key = jax.random.split(key)
     states, log = learn_to_walk(settings, learn_key, session=session, name="walk")
     policy = states.policy
+    # With noise of its own: what chooses a policy must not judge it.
+    choose_key = jax.random.fold_in(key, 1)
+    _, trial = walk_at_all_speeds(settings, choose_key, policy, noise=settings.learning_noise)
     speeds, outcome = walk_at_all_speeds(settings, evaluate_key, policy)
     fine = settings.speeds(51)
     policies = [
@@ -228,6 +232,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         "fine_speeds": fine,
         "fine_theta": np.stack([[policy.theta(float(speed)) for speed in fine] for policy in policies]),
         "speeds": speeds,
+        "trial_reward": trial.reward.mean(axis=(1, 2)),
         "reward": outcome.reward,
         "speed": outcome.speed,
         "fell": outcome.fell,
@@ -272,8 +277,12 @@ def learn_to_walk(
     )
 
 
-def walk_at_all_speeds(settings: Settings, key: jax.Array, policy: LinearGaussian) -> tuple[np.ndarray, Any]:
+def walk_at_all_speeds(
+    settings: Settings, key: jax.Array, policy: LinearGaussian, *, noise: float = 1.0
+) -> tuple[np.ndarray, Any]:
     """Roll out the mean policies (trials, ...) at 11 speeds, for the NAO the paper's, with fresh seeds.
+
+    They walk in so many times the usual noise.
 
     Returns:
         The speeds (n,), m/s, and the outcome (trials, n, seeds).
@@ -281,7 +290,9 @@ def walk_at_all_speeds(settings: Settings, key: jax.Array, policy: LinearGaussia
     speeds = settings.speeds()
     contexts = speeds[:, None]
     thetas = np.asarray(jax.vmap(make_algorithm(settings).mean, (0, None))(policy, contexts))
-    return speeds, evaluate_trials(key, make_task(settings), contexts, thetas, repeats=settings.eval_seeds)
+    return speeds, evaluate_trials(
+        key, make_task(settings, noise=noise), contexts, thetas, repeats=settings.eval_seeds
+    )
 
 
 def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None = None) -> Task:
@@ -380,7 +391,12 @@ def saved_policy(settings: Settings, policy: LinearGaussian) -> SavedPolicy:
 
 
 def chosen_trial(arrays: Mapping[str, np.ndarray]) -> int:
-    """Choose the trial whose policy is kept: by its last iterations of learning, not by its evaluation."""
+    """Choose the trial whose policy is kept, not by its evaluation.
+
+    Where its mean policy has not walked for that, its last iterations of learning decide.
+    """
+    if "trial_reward" in arrays:
+        return int(np.argmax(arrays["trial_reward"]))
     return int(np.argmax(arrays["log.mean_reward"][:, -10:].mean(axis=1)))
 
 

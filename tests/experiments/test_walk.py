@@ -67,6 +67,7 @@ def test_the_result_folder_is_complete(bench):
     assert arrays["speed"].shape == (2, 11, 3, 2)
     assert arrays["fine_theta"].shape == (2, 51, 10)
     np.testing.assert_array_equal(arrays["episodes"], [90, 180])
+    assert arrays["trial_reward"].shape == (2,)
 
     # The file's policy does what was evaluated, and the table says so.
     policy, trial = load_policy(folder / "policy.npz"), walk.chosen_trial(arrays)
@@ -81,6 +82,24 @@ def test_the_result_folder_is_complete(bench):
     walking_policy.show(0.3, None, out=None, seed=0, say=said.append)
     assert said[0] == f"policy: {folder / 'policy.npz'}"
     assert said[-1] == "video: results/walk/walk-0.30.mp4"
+
+
+def test_the_policy_is_kept_that_walks_best_in_the_noise_of_learning(bench, monkeypatch):
+    asked = []
+    walk_at_all_speeds = walk.walk_at_all_speeds
+
+    def watched(settings, key, policy, *, noise=1.0):
+        asked.append((noise, jax.random.key_data(key).tolist()))
+        return walk_at_all_speeds(settings, key, policy, noise=noise)
+
+    monkeypatch.setattr(walk, "walk_at_all_speeds", watched)
+    arrays = walk.run(dataclasses.replace(walk.SETTINGS["quick"], learning_noise=1.6), jax.random.key(0))
+    assert [noise for noise, _ in asked] == [1.6, 1.0]
+    # What chooses does not judge.
+    assert asked[0][1] != asked[1][1]
+    for best in (0, 1):
+        arrays["trial_reward"] = np.where(np.arange(2) == best, -1.0, -2.0)
+        assert walk.chosen_trial(arrays) == best
 
 
 @pytest.mark.usefixtures("simple_updates")
