@@ -130,7 +130,9 @@ def fit_weighted_ml(
 
     The fit does not depend on the units and zeros of parameters and features. The ridge shrinks the policy
     towards the weighted mean of theta (as far as the features can express a constant), not towards zero: it
-    penalises how the mean changes with the context, from whatever zero the context is measured.
+    penalises how the mean changes with the context. Powers of a context are other features for another zero
+    of the context, and the ridge holds them otherwise: with them, measure the context from the middle of its
+    range, or set the ridge to zero.
 
     Args:
         features: Policy features varphi of the context of each sample.

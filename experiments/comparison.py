@@ -44,6 +44,7 @@ class LearnerSettings:
         iterations: iterations of learning.
         trials: trials of each contender; the paper has 5.
         samples: N, new samples of an iteration.
+        first_samples: new samples of the first iteration; None is `samples`.
         archive_size: L, samples kept.
         kl_bound: epsilon, nats.
         ridge: relative penalty on the policy's coefficients.
@@ -60,6 +61,7 @@ class LearnerSettings:
     iterations: int = 1000
     trials: int = 20
     samples: int = 40
+    first_samples: int | None = None
     archive_size: int = 2000
     kl_bound: float = 0.5
     ridge: float = 1e-4
@@ -114,7 +116,7 @@ def compare(
     # Rollouts as short as these are not worth sharing out, trials are.
     devices = jax.local_devices()
     devices = devices[: max(num for num in range(1, len(devices) + 1) if settings.trials % num == 0)]
-    plan = Plan(settings.iterations, settings.samples)
+    plan = Plan(settings.iterations, settings.samples, settings.first_samples)
     learn_key, evaluate_key = jax.random.split(key)
     evaluated = np.unique(np.linspace(1, plan.iterations, NUM_EVALUATED).round().astype(int))
     arrays = {

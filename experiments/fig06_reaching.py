@@ -40,9 +40,13 @@ class Settings(LearnerSettings):
 
     Attributes:
         num_centers: K, along each of the two contexts, as in the paper.
+        bandwidth: width sigma of the RBFs, m; as printed its square is (max - min) / K.
     """
 
+    iterations: int = 2000
+    first_samples: int | None = 2000
     num_centers: int = 2
+    bandwidth: float = 0.5**0.5
 
 
 SETTINGS = {"paper": Settings(), "quick": Settings(iterations=200, trials=5)}
@@ -60,7 +64,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     """
     linear = (linear_features(2), quadratic_features(2))
     quadratic = _linear_and_squares()
-    rbf = rbf_features(LOW, HIGH, settings.num_centers)
+    rbf = rbf_features(LOW, HIGH, settings.num_centers, bandwidth=settings.bandwidth)
     gaussian, uniform = gaussian_contexts(LOW, HIGH, clip=True), uniform_contexts(LOW, HIGH)
     contenders = {
         name: make_contender(via_point_reaching(LOW, HIGH, sample_context=sampler), features, settings)

@@ -1,7 +1,7 @@
 """Evaluate a walking policy at 11 speeds, 50 fresh episodes each; the NAO's beside the paper's Table 2.
 
     python -m experiments.benchmarks.policy [POLICY.npz] [--robot NAME] [--noise TIMES]
-                                            [--placement-gain GAIN]
+                                            [--placement-gain GAIN] [--seed SEED]
 
 Without a file it is the shipped policy of the robot. The last options show what more noise, or steps that
 answer to a sideways tilt otherwise than those that the policy was learned with, do to it.
@@ -38,6 +38,7 @@ def main(
     robot: str | None = None,
     noise: float = 1.0,
     placement_gain: float | None = None,
+    seed: int = 2026,
 ) -> None:
     """Measure a policy and print its table.
 
@@ -46,13 +47,14 @@ def main(
         robot: Whose policy; nao by default, or the one of the file.
         noise: How many times the usual noise.
         placement_gain: In place of the one that the policy was learned with.
+        seed: Seed of the noise.
     """
     saved = load_walking_policy(policy or shipped_policy(robot), robot)
     balance = balance_of(saved)
     if placement_gain is not None:
         balance = balance._replace(placement_gain=placement_gain)
     task = nao_walk(robot=robot_of(saved), balance=balance, noise=WalkNoise().times(noise))
-    outcome = walk_at_all_speeds(saved, task, seed=2026)
+    outcome = walk_at_all_speeds(saved, task, seed=seed)
     print(
         tables.to_markdown(tables.speed_table(speeds_of(saved), outcome.reward, outcome.speed, outcome.fell))
     )

@@ -33,7 +33,13 @@ def test_whole_run(benchmark, name, trials):
     keys = jax.random.split(jax.random.key(0), trials)
 
     def run():
-        states, _ = train_trials(keys, *contender, iterations=settings.iterations, samples=settings.samples)
+        states, _ = train_trials(
+            keys,
+            *contender,
+            iterations=settings.iterations,
+            samples=settings.samples,
+            first_samples=settings.first_samples,
+        )
         jax.block_until_ready(states)
 
     benchmark.pedantic(run, warmup_rounds=1, rounds=1)

@@ -52,11 +52,12 @@ def test_a_figure_searches_draws_and_judges(name):
 
 def check_figure(name):
     experiment = importlib.import_module(f"experiments.{name}")
-    few = {"iterations": 2, "trials": 2, "samples": 30, "archive_size": 60}
+    few = {"iterations": 2, "trials": 2, "samples": 30, "first_samples": 60, "archive_size": 60}
     settings = dataclasses.replace(experiment.SETTINGS["quick"], **few)
     arrays = experiment.run(settings, jax.random.key(0), Session())
     names = [key.removesuffix(".coef") for key in arrays if key.endswith(".coef")]
     assert len(names) >= 2
+    np.testing.assert_array_equal(arrays["episodes"], [60, 90])
     for contender in names:
         assert arrays[f"{contender}.sample_reward"].shape == (2, 2)
         assert arrays[f"{contender}.grid_reward"].shape == (2, 2, len(arrays["context"]))
@@ -67,7 +68,25 @@ def check_figure(name):
     for claim in experiment.CLAIMS:
         value = claim.measure(arrays)
         # What needs other numbers of RBFs says so.
-        assert np.isfinite(value) or "numbers of RBFs" in claim.metric
+        assert np.isfinite(value) or "numbers of RBFs" in claim.metric or "20 RBFs" in claim.metric
+
+
+@pytest.mark.parametrize("name", ["fig06_reaching", "fig08_hole"])
+def test_the_arm_is_learned_from_a_full_archive(name):
+    for settings in importlib.import_module(f"experiments.{name}").SETTINGS.values():
+        assert settings.first_samples == settings.archive_size
+
+
+def test_the_worst_number_of_rbfs_is_the_worst_of_all():
+    rng = np.random.default_rng(0)
+    rewards = {"rbf4": -2.0, "rbf6": -1.0, "rbf10": -3.0, "rbf20": -4.0}
+    arrays = made_up(**{name: rng.uniform(x, x + 0.5, (10, 3)) for name, x in rewards.items()})
+    arrays |= {f"{name}.coef": np.zeros(1) for name in rewards}
+    assert fig08_hole._p_of_the_worst(arrays) < 0.05
+    arrays["rbf10.grid_reward"] = arrays["rbf20.grid_reward"] - 0.1
+    assert fig08_hole._p_of_the_worst(arrays) > 0.9
+    del arrays["rbf4.coef"]
+    assert np.isnan(fig08_hole._p_of_the_worst(arrays))
 
 
 def test_updates_are_compared_on_the_same_problem(monkeypatch, tmp_path):
