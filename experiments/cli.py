@@ -27,7 +27,7 @@ Learn, plot and check what the project can do.
   python -m experiments run walk --speed 0.3      show the learned walk at a speed, in m/s
   python -m experiments run walk --robot nao_h25  learn it for the real NAO's figures
   python -m experiments run walk --resume         go on with the latest unfinished run
-  python -m experiments run all                   the paper's Figures 5 to 9, some ten minutes
+  python -m experiments run all                   the paper's Figures 5 to 9, half an hour
   python -m experiments plot walk                 draw the figures of the latest results again
   python -m experiments check                     hold the latest results against the paper
   python -m experiments video                     film a policy at several speeds
