@@ -61,6 +61,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 A = TypeVar("A", Array, np.ndarray)
 _Arrays = dict[str, tuple[list[str], tuple[int, ...]]]
 """Names and sizes of the axes of arguments."""
+_SMALLEST_WEIGHT = 1e-30
+"""Size of the largest weight, or the inverse of it, from which on weights are scaled."""
 
 
 def arguments(function: F) -> F:
@@ -252,6 +254,15 @@ def finite(
         if not is_good.all():
             raise ValueError(f"{name} must be {_limits(least, above, largest)}, got {known[~is_good][0]}")
     return values
+
+
+def in_range(weights: Any) -> Any:
+    """Return weights, of which only ratios matter, in the range of single precision, as exp(-200) is not."""
+    if isinstance(weights, np.ndarray) and weights.dtype == np.float64 and np.isfinite(weights).all():
+        largest = weights.max(initial=0.0)
+        if largest > 0 and not _SMALLEST_WEIGHT < largest < 1.0 / _SMALLEST_WEIGHT:
+            return weights / largest
+    return weights
 
 
 def key(name: str, value: Any, *, num_axes: int = 0) -> Any:

@@ -566,7 +566,7 @@ def _checked_samples(reward: Any, features: Any, valid: Any) -> tuple[Array, Arr
     reward, features = reward.astype(dtype), features.astype(dtype)
     if valid is None:
         return reward, features, jnp.ones_like(reward)
-    return reward, features, checks.array("valid", valid, reward.shape)
+    return reward, features, checks.array("valid", checks.in_range(valid), reward.shape)
 
 
 def _checked_solution(solution: DualSolution, features: Array) -> DualSolution:

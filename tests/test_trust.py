@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import creps_jax as cj
 from creps_jax.archive import Batch
 from creps_jax.contexts import uniform_contexts
 from creps_jax.creps import creps
@@ -340,3 +341,16 @@ def test_rewards_that_are_coarse_in_the_format_they_were_told_in_are_warned_of(d
     offset = {np.float16: 2e4, np.float32: 1e7}[dtype]
     with pytest.warns(UserWarning, match="batch.reward has a spread of"):
         tell((offset + 3.0 * REWARDS).astype(dtype))
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-150, 1e-50, 1e-30, 1e30, 1e60, 1e300])
+def test_only_the_ratios_of_what_counts_matter_even_where_single_precision_ends(size):
+    features = np.concatenate([np.ones((NUM, 1)), CONTEXTS], axis=1)
+    valid = np.linspace(0.5, 1.0, NUM)
+
+    def results(valid):
+        solution = cj.solve_dual(REWARDS, features, valid, kl_bound=0.5)
+        return solution, cj.sample_weights(solution, REWARDS, features, valid)
+
+    for found, expected in zip(*map(jax.tree.leaves, (results(valid * size), results(valid))), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
