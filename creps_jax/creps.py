@@ -463,7 +463,7 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
     spread = jnp.max(jnp.abs(reward))
     info = CrepsInfo(
         dual=dual,
-        kl=jnp.maximum(sample_kl(weights, prior), 0.0),
+        kl=sample_kl(weights, prior),
         policy_kl=jnp.where(is_updated, _mean_kl(policy, state.policy, features, is_valid), 0.0),
         effective_samples=_effective_samples(weights),
         prior_effective_samples=_effective_samples(prior),

@@ -231,10 +231,11 @@ def sample_kl(weights: Float[Array, " n"], valid: Valid | None = None) -> Scalar
     if weights.shape != prior.shape:
         raise ValueError(f"weights and valid have to have one shape, got {weights.shape} and {prior.shape}")
     prior = normalised(prior).astype(weights.dtype)
-    # By terms of d log(d / p) - d + p, which are not negative: those of sum d log(d / p) would cancel.
+    # By terms of d log(d / p) - d + p, which are not negative but for rounding: those of sum d log(d / p)
+    # would cancel.
     change = weights / jnp.where(prior > 0, prior, 1.0) - 1.0
     log_ratio = jnp.log1p(jnp.where(change > -1.0, change, 0.0))
-    return jnp.sum(weights * log_ratio - prior * change, where=prior > 0)
+    return jnp.maximum(jnp.sum(weights * log_ratio - prior * change, where=prior > 0), 0.0)
 
 
 @jax.jit

@@ -71,10 +71,10 @@ def bounded_ml(
     The mean that is likeliest within its bound, at the old covariance, is a share `g / (g + l c)` of the
     whole way, with a multiplier l, in features that are uncorrelated both over the contexts, with a mean
     square c, and over the weighted samples, with a mean square g that counts the ridge. The whole way is that
-    of `weighted_ml`. The covariance
-    that is likeliest within its bounds is, along the eigenvectors of the weighted covariance s (made
-    unbiased, as in `fit_weighted_ml`), the root x of `l x^2 - (l + m - 1) x - s = 0`, where m is the
-    multiplier of the bound on the loss of entropy. No spread falls to below the rounding of theta.
+    of `weighted_ml`. The covariance that is likeliest within its bounds is, along the eigenvectors of the
+    weighted covariance s (made unbiased, as in `fit_weighted_ml`), the root x of
+    `l x^2 - (l + m - 1) x - s = 0`, where m is the multiplier of the bound on the loss of entropy. A spread
+    does not fall below the rounding of theta; one that is already below it does not fall further.
 
     Args:
         mean_kl_bound: Largest part of the mean in the relative entropy, nats.
@@ -214,8 +214,8 @@ def _as_cov_chol(root: Float[Array, "d d"], old_chol: Float[Array, "d d"]) -> Fl
     """Return the Cholesky factor of a covariance whose root is given, for parameters of size one."""
     upper = jnp.linalg.qr(root.T, mode="r")
     cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
-    # Below the rounding of theta a spread means nothing, and would shrink to zero. One that has begun there
-    # may stay: to raise it would break the bounds.
+    # Below the rounding of theta a spread means nothing, and would shrink to zero. One that is already
+    # there may stay: to raise it would break the bounds.
     least = jnp.minimum(4.0 * jnp.finfo(cov_chol.dtype).eps, jnp.linalg.norm(old_chol, axis=1))
     return cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]
 

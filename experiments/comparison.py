@@ -180,6 +180,13 @@ def signed_rank_p(gains: np.ndarray) -> float:
     return float(stats.wilcoxon(gains, alternative="greater").pvalue) if gains.any() else 1.0
 
 
+def median_and_interval(rewards: np.ndarray) -> str:
+    """Return the median and, of six trials or more, its interval of 95 % confidence, by order statistics."""
+    median = f"{np.median(rewards):.3g}"
+    low, high = stats.quantile_test(rewards, p=0.5).confidence_interval(0.95)
+    return median if math.isnan(low) else f"{median} ({low:.3g} to {high:.3g})"
+
+
 def share_of_episodes(
     episodes: np.ndarray, curve: np.ndarray, reference: np.ndarray, *, total: float | None = None
 ) -> float:

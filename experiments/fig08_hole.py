@@ -175,7 +175,7 @@ CLAIMS = (
         high=0.05,
     ),
     Claim(
-        "linear: the same at the ends of the range",
+        "linear: share of trials and holes with a collision, at the ends of the range",
         None,
         lambda arrays: _collides_at_the_ends(arrays, "linear"),
         low=0.05,

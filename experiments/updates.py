@@ -195,22 +195,10 @@ def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
         for bench in BENCHES:
             contender = fits(arrays, bench).get(label)
             curve = None if contender is None else mean_policy_curve(of_bench(arrays, bench), contender)[1]
-            columns[label].append("" if curve is None else median_and_interval(curve[:, -1]))
+            columns[label].append("" if curve is None else comparison.median_and_interval(curve[:, -1]))
         if label == LABELS["bounded"]:
             columns["as good after"] = [f"{share_of_episodes(arrays, bench):.0%}" for bench in BENCHES]
     return columns
-
-
-def median_and_interval(rewards: np.ndarray) -> str:
-    """Return the median and, of six trials or more, its interval of 95 % confidence, by order statistics."""
-    median, ordered = f"{np.median(rewards):.3g}", np.sort(rewards)
-    # The largest k for which fewer than k of n fair coins come up heads in 2.5 % of all cases at most.
-    num = len(ordered)
-    chances = np.cumsum([math.comb(num, heads) for heads in range(num + 1)]) / 2.0**num
-    below = int(np.searchsorted(chances, 0.025, side="right"))
-    if below == 0:
-        return median
-    return f"{median} ({ordered[below - 1]:.3g} to {ordered[num - below]:.3g})"
 
 
 def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:

@@ -211,17 +211,15 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
 
     Returns:
         Arrays of the learning (trials, iterations), the policies, their parameters over the speeds
-        (trials, n, d), the evaluation (trials, n, seeds), and `trial_reward` (trials,), by which the policy
-        that is kept is chosen: the mean over the same speeds in the noise of learning.
+        (trials, n, d), the evaluation (trials, n, seeds), and, of several trials, `trial_reward` (trials,):
+        the mean over the same speeds in the noise of learning, by which the policy that is kept is chosen.
     """
     if settings.constraint != "sigmoid":
         raise UserError(f"a policy is only kept with the constraint sigmoid, got {settings.constraint!r}")
     evaluate_key, learn_key = jax.random.split(key)
     states, log = learn_to_walk(settings, learn_key, session=session, name="walk")
     policy = states.policy
-    # With noise of its own: what chooses a policy must not judge it.
-    choose_key = jax.random.fold_in(key, 1)
-    _, trial = walk_at_all_speeds(settings, choose_key, policy, noise=settings.learning_noise)
+    trial_reward = _trial_reward(settings, jax.random.fold_in(key, 1), policy)
     speeds, outcome = walk_at_all_speeds(settings, evaluate_key, policy)
     fine = settings.speeds(51)
     policies = [
@@ -232,12 +230,20 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         "fine_speeds": fine,
         "fine_theta": np.stack([[policy.theta(float(speed)) for speed in fine] for policy in policies]),
         "speeds": speeds,
-        "trial_reward": trial.reward.mean(axis=(1, 2)),
+        **trial_reward,
         "reward": outcome.reward,
         "speed": outcome.speed,
         "fell": outcome.fell,
         **{f"bound_{side}": np.array(settings.box()[i]) for i, side in enumerate(("low", "high"))},
     }
+
+
+def _trial_reward(settings: Settings, key: jax.Array, policy: LinearGaussian) -> dict[str, np.ndarray]:
+    """Walk to choose among several trials, with random numbers that the evaluation does not have."""
+    if settings.trials == 1:
+        return {}
+    _, outcome = walk_at_all_speeds(settings, key, policy, noise=settings.learning_noise)
+    return {"trial_reward": outcome.reward.mean(axis=(1, 2))}
 
 
 def learned(settings: Settings, policy: LinearGaussian, log: Log) -> dict[str, np.ndarray]:

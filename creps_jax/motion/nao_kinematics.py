@@ -120,12 +120,11 @@ def leg_ik(
 ) -> Float[Array, "6"]:
     """Return the joint angles that bring the sole to a pose in the torso frame, the inverse of `leg_fk`.
 
-    The solution is exact for every pose within the joint limits but those of a folded leg whose hip comes
-    within 3 mm of the foot's plane through the ankle roll axis, 1 % of all postures within the limits: there
-    the roll, and with it other angles, are others than those of the posture, and the pose is met to 1 mm. A
-    pose too far from the hip, or too near, keeps its foot orientation, and the leg is held at its reach on
-    the line from the ankle pitch axis to the hip. The knee stays within its limits; the other angles are not
-    clipped.
+    The solution is exact for every pose within the joint limits, except for that of a folded leg whose hip
+    comes within 3 mm of the foot's plane through the ankle roll axis (1 % of all postures within the limits).
+    There the angles differ from those of the posture, and the pose is met to 1 mm. A pose too far from the
+    hip, or too near, keeps its foot orientation, and the leg is held at its reach on the line from the ankle
+    pitch axis to the hip. The knee stays within its limits; the other angles are not clipped.
 
     Angles and gradients are finite for any pose. The angles are continuous through the reach; jumps are left
     where they are not determined, beyond the joint limits: the hip at the ankle, the hip straight below the

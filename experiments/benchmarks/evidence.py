@@ -29,7 +29,7 @@ from creps_jax.mstep import bounded_ml, weighted_ml  # noqa: E402
 from creps_jax.policy import LinearGaussian  # noqa: E402
 from creps_jax.tasks import PlainOutcome, Task  # noqa: E402
 from creps_jax.train import train_trials  # noqa: E402
-from experiments import plots, tables, updates  # noqa: E402
+from experiments import comparison, plots, tables, updates  # noqa: E402
 from experiments.comparison import LearnerSettings, compare, mean_policy_curve  # noqa: E402
 from experiments.results import save_figure  # noqa: E402
 
@@ -86,7 +86,7 @@ def measure_trade_off(trials: int = 20) -> dict[str, np.ndarray]:
             algorithm = dataclasses.replace(settings, significance=level).algorithm()
             found = compare({name: bounded._replace(algorithm=algorithm)}, plan, learn_key, grid=bench.grid)
             rows.setdefault(name, []).append(mean_policy_curve(found, name)[1][:, -1])
-        found = ", ".join(f"{name} {updates.median_and_interval(row[-1])}" for name, row in rows.items())
+        found = ", ".join(f"{name} {comparison.median_and_interval(row[-1])}" for name, row in rows.items())
         print(f"significance {level}: {found}", flush=True)
     return {name: np.stack(row) for name, row in rows.items()}
 

@@ -61,10 +61,8 @@ def summary(status: Status) -> list[str]:
 def _warnings(status: Status) -> list[str]:
     """Warn of a search that goes by chance."""
     updates, lines = status.updates, []
-    lost, all_lost = (
-        sum(update.unsupported_loss for update in updates),
-        updates[0].entropy - updates[-1].entropy,
-    )
+    lost = sum(update.unsupported_loss for update in updates)
+    all_lost = updates[0].entropy - updates[-1].entropy
     if lost > _MUCH_LOST * max(len(status.settings.parameters), all_lost):
         lines.append(
             f"exploration went without evidence: {lost:.2f} nats of entropy; more trials in a batch or a "

@@ -66,7 +66,7 @@ class FeatureSettings:
     """The features of the policy: the fields of `experiments.policy_file.Features`.
 
     By default there are 5 centres for one context variable, for two 3 along each, and 2 for more: a session
-    has few trials, and 25 centres learn nothing from fifty.
+    has few trials, and 25 centres learn nothing from fifty of them.
     """
 
     kind: str = "rbf"
