@@ -16,7 +16,13 @@ from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.creps import Creps, CrepsState, creps
 from creps_jax.features import quadratic_features
-from creps_jax.motion.walking.params import PAPER_BOUNDS, PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
+from creps_jax.motion.walking.params import (
+    AUTHOR_BOUNDS,
+    PAPER_BOUNDS,
+    PARAM_LABELS,
+    PARAM_NAMES,
+    PARAM_UNITS,
+)
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c, mjx
 from creps_jax.physics.state import ControlStep
@@ -33,7 +39,11 @@ from experiments.registry import Claim
 from experiments.robots import WALKERS, Bounds, Walker, find_walker
 from experiments.walking_policy import POLICY, START_UP, filmed_speeds, record, save_film
 
-BOUNDS = {**{name: walker.bounds for name, walker in WALKERS.items()}, "paper": PAPER_BOUNDS}
+BOUNDS = {
+    **{name: walker.bounds for name, walker in WALKERS.items()},
+    "author": AUTHOR_BOUNDS,
+    "paper": PAPER_BOUNDS,
+}
 SAMPLERS = {"gaussian": partial(gaussian_contexts, clip=True), "uniform": uniform_contexts}
 CONSTRAINTS = ("sigmoid", "penalty")
 PENALTY = 1000.0
@@ -55,7 +65,10 @@ PHYSICS = {"auto": _fastest, "mjx": mjx.make_control_step, "c": c.make_control_s
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Settings of the experiment; the preset `paper` is the paper's protocol, as far as DEVIATIONS.md goes.
+    """Settings of the experiment.
+
+    The preset `paper` is the paper's protocol, as far as DEVIATIONS.md goes, and `author` the settings of the
+    scripts that its author published.
 
     Attributes:
         robot: who learns to walk, a name in WALKERS.
@@ -202,6 +215,14 @@ SETTINGS = {
         learning_duration=5.0,
     ),
     "paper": Settings(trials=5, bounds="paper"),
+    "author": Settings(
+        trials=5,
+        bounds="author",
+        samples=20,
+        first_samples=500,
+        kl_bound=1.0,
+        features=Features("rbf", 5, bandwidth=0.09),
+    ),
     "best": dataclasses.replace(_OURS, iterations=90, samples=40, archive_size=200, eval_seeds=50),
 }
 

@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 
 from creps_jax.motion.robots import NAO, NAO_H25
-from creps_jax.motion.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS, PAPER_BOUNDS, PARAM_NAMES
+from creps_jax.motion.walking.params import (
+    AUTHOR_BOUNDS,
+    NAO_BOUNDS,
+    NAO_H25_BOUNDS,
+    PAPER_BOUNDS,
+    PARAM_NAMES,
+)
 from creps_jax.motion.walking.posture import Balance
 from creps_jax.physics import c
 from creps_jax.tasks.base import Task
@@ -214,6 +220,7 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
     settings = dataclasses.replace(walk.SETTINGS["quick"], robot="nao_h25")
     assert settings.box() == NAO_H25_BOUNDS
     assert dataclasses.replace(settings, bounds="paper").box() == PAPER_BOUNDS
+    assert dataclasses.replace(settings, bounds="author").box() == AUTHOR_BOUNDS
     contexts = jax.vmap(walk.make_task(settings).sample_context)(jax.random.split(jax.random.key(0), 500))
     assert asked["robot"] is NAO_H25
     low, high = WALKERS["nao_h25"].low, WALKERS["nao_h25"].high

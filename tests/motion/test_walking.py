@@ -20,6 +20,7 @@ from creps_jax.motion.nao_kinematics import leg_fk
 from creps_jax.motion.walking.engine import joint_targets, plan_step, plan_walk, pose_at
 from creps_jax.motion.walking.footsteps import FOOT_SPACING, next_footstep, standing
 from creps_jax.motion.walking.params import (
+    AUTHOR_BOUNDS,
     NAO_BOUNDS,
     NAO_H25_BOUNDS,
     PAPER_BOUNDS,
@@ -54,12 +55,12 @@ def walk_of(theta, command):
 def test_names_units_and_bounds_belong_together():
     assert WalkParams._fields == PARAM_NAMES
     assert len(PARAM_NAMES) == len(PARAM_UNITS) == len(PARAM_LABELS) == 10
-    for low, high in (NAO_BOUNDS, NAO_H25_BOUNDS, PAPER_BOUNDS):
+    for low, high in (NAO_BOUNDS, NAO_H25_BOUNDS, PAPER_BOUNDS, AUTHOR_BOUNDS):
         assert len(low) == len(high) == 10
         assert all(np.array(low) < np.array(high))
 
 
-@pytest.mark.parametrize("bounds", [NAO_BOUNDS, PAPER_BOUNDS], ids=["nao", "paper"])
+@pytest.mark.parametrize("bounds", [NAO_BOUNDS, PAPER_BOUNDS, AUTHOR_BOUNDS], ids=["nao", "paper", "author"])
 @pytest.mark.parametrize("widening", [1.0, 30.0, 1e6])
 def test_every_theta_gives_finite_targets_within_the_limits(bounds, widening):
     low, high = np.array(bounds, np.float32)

@@ -9,6 +9,7 @@ from creps_jax import checks
 from creps_jax.typing import Array, Float, Scalar
 
 __all__ = [
+    "AUTHOR_BOUNDS",
     "GRAVITY",
     "NAO_BOUNDS",
     "NAO_H25_BOUNDS",
@@ -60,6 +61,13 @@ PAPER_BOUNDS = (
     (1.0, 0.22, 0.15, 3.0, 5.0, 1.0, 1.0, 0.5, 1.0, 0.5),
 )
 """Lower and upper bounds of theta, as the paper prints them (Section 4.3.1)."""
+
+AUTHOR_BOUNDS = (
+    (0.0, 0.16, 0.02, 0.01, 0.0, 0.0, 0.0, 0.02, 0.0, 0.0),
+    (0.01, 0.22, 0.2, 1.8, 5.0, 1.0, 1.0, 0.4, 0.5, 0.2),
+)
+"""Bounds of the experiment scripts that the paper's author published, with the amplitude A limited to 0.01 m,
+where they let it go to 1 m: above, the pendulum's equation is singular for most step durations."""
 
 NAO_BOUNDS = (
     (0.0, 0.15, 0.02, 0.14, -5.0, 0.0, 0.0, 0.0, 0.0, 0.02),
