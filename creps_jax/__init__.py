@@ -3,23 +3,22 @@
 from typing import TYPE_CHECKING, Any
 
 from creps_jax import tasks
-from creps_jax.archive import Archive, Batch
-from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
-from creps_jax.creps import Creps, CrepsInfo, CrepsState, creps
-from creps_jax.dual import DualSolution, sample_weights, solve_dual
-from creps_jax.features import (
+from creps_jax.numerics.linalg import thomas_solve
+from creps_jax.policies.features import (
     FeatureMap,
     linear_features,
     quadratic_features,
     rbf_features,
 )
-from creps_jax.importance import Importance
-from creps_jax.linalg import thomas_solve
-from creps_jax.motion.nao_kinematics import leg_fk, leg_ik
-from creps_jax.motion.walking.com import com_trajectory
-from creps_jax.mstep import bounded_ml
-from creps_jax.policy import LinearGaussian, fit_weighted_ml
+from creps_jax.policies.gaussian import LinearGaussian, fit_weighted_ml
+from creps_jax.policies.space import sigmoid_gate
+from creps_jax.robots.nao_kinematics import leg_fk, leg_ik
+from creps_jax.search.archive import Archive, Batch
+from creps_jax.search.creps import Creps, CrepsInfo, CrepsState, creps
+from creps_jax.search.dual import DualSolution, sample_weights, solve_dual
+from creps_jax.search.fit import bounded_ml
+from creps_jax.search.importance import Importance
 from creps_jax.tasks import (
     Outcome,
     Task,
@@ -30,7 +29,8 @@ from creps_jax.tasks import (
     sinus,
     via_point_reaching,
 )
-from creps_jax.train import IterationLog, evaluate, make_iteration, train, train_trials
+from creps_jax.training import IterationLog, evaluate, make_iteration, train, train_trials
+from creps_jax.walking.com import com_trajectory
 
 if TYPE_CHECKING:
     from creps_jax.tasks import nao_walk

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from creps_jax.creps import Creps, creps
-from creps_jax.features import FeatureMap
-from creps_jax.importance import Importance
-from creps_jax.policy import LinearGaussian
+from creps_jax.policies.features import FeatureMap
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.search.creps import Creps, creps
+from creps_jax.search.importance import Importance
 from creps_jax.tasks.base import Task
-from creps_jax.train import evaluate
+from creps_jax.training import evaluate
 from experiments import plots
 from experiments.learning import Plan, Session, learn, make_m_step, trial_keys
 

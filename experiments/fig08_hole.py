@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid
-from creps_jax.features import linear_features, quadratic_features, rbf_features
+from creps_jax.policies.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, hole_movement, hole_reaching
 from experiments import plots
 from experiments.comparison import (

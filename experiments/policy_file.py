@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from creps_jax.checks import shown
-from creps_jax.constraints import sigmoid_gate
-from creps_jax.features import FeatureMap, linear_features, rbf_features
-from creps_jax.policy import LinearGaussian
+from creps_jax.policies.features import FeatureMap, linear_features, rbf_features
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.space import sigmoid_gate
 from creps_jax.typing import VectorLike
 from experiments.errors import UserError
 from experiments.results import ROOT, load_arrays, save_arrays

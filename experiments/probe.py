@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 from jax.experimental import io_callback
 
-from creps_jax.motion.nao_geometry import NUM_JOINTS
-from creps_jax.physics.servos import read_servos
-from creps_jax.physics.state import ControlStep, RobotState, substep_shares
+from creps_jax.robots.nao_geometry import NUM_JOINTS
+from creps_jax.simulation.servos import read_servos
+from creps_jax.simulation.state import ControlStep, RobotState, substep_shares
 
 SOLES = ("left_sole", "right_sole")
 
@@ -57,7 +57,7 @@ class Probe:
         return measured._replace(time=measured.time - measured.time[0])
 
     def make_control_step(self, model: mujoco.MjModel, num_substeps: int) -> ControlStep:
-        """Return a control step as `creps_jax.physics.c` makes it, by single steps; not to be vmapped."""
+        """Return a control step as `creps_jax.simulation.c` makes it, by single steps; not to be vmapped."""
         shares, servos = substep_shares(num_substeps), read_servos(model)
         data = mujoco.MjData(model)
 

@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from creps_jax.motion.robots import NAO, NAO_H25, Robot
-from creps_jax.motion.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS
+from creps_jax.robots.robot import NAO, NAO_H25, Robot
+from creps_jax.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS
 from experiments.errors import UserError
 from experiments.registry import suggest
 

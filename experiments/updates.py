@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid
-from creps_jax.features import FeatureMap, linear_features, rbf_features
+from creps_jax.policies.features import FeatureMap, linear_features, rbf_features
 from creps_jax.tasks import Task, contextual_function, hole_reaching, sinus, via_point_reaching
 from creps_jax.tasks.functions import ackley, ellipsoid, rastrigin, rosenbrock, sphere
 from experiments import comparison, plots

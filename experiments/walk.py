@@ -12,25 +12,25 @@ import mujoco
 import numpy as np
 from matplotlib.figure import Figure
 
-from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
-from creps_jax.creps import Creps, CrepsState, creps
-from creps_jax.features import quadratic_features
-from creps_jax.motion.walking.params import (
+from creps_jax.policies.features import quadratic_features
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.space import sigmoid_gate
+from creps_jax.search.creps import Creps, CrepsState, creps
+from creps_jax.simulation import c, mjx
+from creps_jax.simulation.state import ControlStep
+from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constrained
+from creps_jax.tasks.conditions import Condition
+from creps_jax.tasks.walking import WalkNoise, nao_walk
+from creps_jax.training import evaluate
+from creps_jax.walking.params import (
     AUTHOR_BOUNDS,
     PAPER_BOUNDS,
     PARAM_LABELS,
     PARAM_NAMES,
     PARAM_UNITS,
 )
-from creps_jax.motion.walking.posture import Balance
-from creps_jax.physics import c, mjx
-from creps_jax.physics.state import ControlStep
-from creps_jax.policy import LinearGaussian
-from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constrained
-from creps_jax.tasks.conditions import Condition
-from creps_jax.tasks.nao_walk import WalkNoise, nao_walk
-from creps_jax.train import evaluate
+from creps_jax.walking.posture import Balance
 from experiments import plots, results, tables
 from experiments.errors import UserError
 from experiments.learning import Log, Plan, Session, learn, make_m_step, trial_keys

@@ -12,13 +12,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from creps_jax.motion.nao_geometry import JOINT_NAMES
-from creps_jax.motion.walking.engine import plan_walk
-from creps_jax.motion.walking.params import params_from_theta
-from creps_jax.motion.walking.posture import Balance
-from creps_jax.motion.walking.zmp import zmp_reference
-from creps_jax.rotations import quat_to_rpy
-from creps_jax.tasks.nao_walk import WalkNoise, record_walk
+from creps_jax.numerics.rotations import quat_to_rpy
+from creps_jax.robots.nao_geometry import JOINT_NAMES
+from creps_jax.tasks.walking import WalkNoise, record_walk
+from creps_jax.walking.engine import plan_walk
+from creps_jax.walking.params import params_from_theta
+from creps_jax.walking.posture import Balance
+from creps_jax.walking.zmp import zmp_reference
 from experiments import plots
 from experiments.errors import UserError
 from experiments.learning import Session

@@ -13,9 +13,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid
-from creps_jax.motion.walking.params import PARAM_UNITS
-from creps_jax.policy import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.tasks.conditions import Condition, slope
+from creps_jax.walking.params import PARAM_UNITS
 from experiments import plots, tables, walk
 from experiments.errors import UserError
 from experiments.learning import Session

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from creps_jax.motion.robots import NAO, Robot
-from creps_jax.motion.walking.params import PARAM_NAMES
-from creps_jax.motion.walking.posture import Balance
-from creps_jax.physics import c
+from creps_jax.robots.robot import NAO, Robot
+from creps_jax.simulation import c
 from creps_jax.tasks.conditions import slope
-from creps_jax.tasks.nao_walk import CONTROL_PERIOD, model_path, record_walk
+from creps_jax.tasks.walking import CONTROL_PERIOD, model_path, record_walk
+from creps_jax.walking.params import PARAM_NAMES
+from creps_jax.walking.posture import Balance
 from experiments import results
 from experiments.errors import UserError
 from experiments.policy_file import SavedPolicy, load_policy, policies_folder

@@ -37,9 +37,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import creps_jax as cj
-from creps_jax import policy as gaussian
-from creps_jax.dual import dual_objective, sample_kl
-from creps_jax.mstep import WeightedSamples, weighted_ml
+from creps_jax.policies import gaussian
+from creps_jax.search.dual import dual_objective, sample_kl
+from creps_jax.search.fit import WeightedSamples, weighted_ml
 from experiments import plots
 
 # %% [markdown]

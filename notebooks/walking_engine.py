@@ -37,11 +37,11 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 
-from creps_jax.motion.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
-from creps_jax.motion.walking.com import spring_height, zmp_of_com
-from creps_jax.motion.walking.engine import NUM_NODES, plan_walk, pose_at, pose_joints
-from creps_jax.motion.walking.params import PARAM_NAMES, PARAM_UNITS, params_from_theta
-from creps_jax.motion.walking.zmp import zmp_reference
+from creps_jax.robots.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
+from creps_jax.walking.com import spring_height, zmp_of_com
+from creps_jax.walking.engine import NUM_NODES, plan_walk, pose_at, pose_joints
+from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS, params_from_theta
+from creps_jax.walking.zmp import zmp_reference
 from experiments.plots import COLOURS
 from experiments.policy_file import load_policy
 

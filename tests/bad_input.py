@@ -26,18 +26,18 @@ from hypothesis import strategies as st
 
 import creps_jax as cj
 from creps_jax import rotations, tasks
-from creps_jax.archive import push
-from creps_jax.dual import DualSolution
-from creps_jax.features import polynomial_features
-from creps_jax.motion import dmp, nao_geometry, nao_kinematics
-from creps_jax.motion.robots import NAO, NAO_H25
-from creps_jax.motion.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
-from creps_jax.motion.walking.posture import Balance
-from creps_jax.mstep import WeightedSamples, weighted_ml
-from creps_jax.physics import c, fit, mjx, servos, world
-from creps_jax.physics import state as physics_state
-from creps_jax.tasks import conditions, functions, planar_arm
-from creps_jax.tasks.nao_walk import WalkNoise, WalkReward, load_nao, record_walk
+from creps_jax.policies.features import polynomial_features
+from creps_jax.robots import nao_geometry, nao_kinematics
+from creps_jax.robots.robot import NAO, NAO_H25
+from creps_jax.search.archive import push
+from creps_jax.search.dual import DualSolution
+from creps_jax.search.fit import WeightedSamples, weighted_ml
+from creps_jax.simulation import c, fit, mjx, servos, world
+from creps_jax.simulation import state as physics_state
+from creps_jax.tasks import conditions, dmp, functions, planar_arm
+from creps_jax.tasks.walking import WalkNoise, WalkReward, load_nao, record_walk
+from creps_jax.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
+from creps_jax.walking.posture import Balance
 
 # What of an argument an error names, where it is a part of it.
 NAMES = {

@@ -35,20 +35,20 @@ with contextlib.redirect_stdout(io.StringIO()):
 
 # The files that take longest, the longest first: workers that begin with them end together.
 LONG_FILES = (
-    "test_train.py",
-    "test_nao_walk.py",
+    "test_training.py",
+    "test_walking.py",
     "test_comparison.py",
     "test_dual.py",
     "test_walk.py",
     "test_documents.py",
     "test_creps.py",
-    "test_mstep.py",
+    "test_fit.py",
     "test_several_processes.py",
     "test_bad_input.py",
     "test_protocols.py",
     "test_kills.py",
     "test_control_step.py",
-    "test_sinus.py",
+    "test_sine.py",
 )
 
 

@@ -1,10 +1,14 @@
 """Hold the imports to the layers that pyproject.toml declares."""
 
 import contextlib
+import importlib
 import io
+import pkgutil
 from pathlib import Path
 
 from importlinter.cli import lint_imports
+
+import creps_jax
 
 ROOT = Path(__file__).parents[1]
 
@@ -14,3 +18,15 @@ def test_imports_keep_their_contracts():
     with contextlib.redirect_stdout(report):
         status = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
     assert status == 0, report.getvalue()
+
+
+def test_no_module_has_the_name_of_something_public():
+    # The one would hide the other, depending on which is imported first.
+    modules = {module.name for module in pkgutil.walk_packages(creps_jax.__path__, "creps_jax.")}
+    hidden = {
+        f"{package}.{name}"
+        for package in ("creps_jax", "creps_jax.tasks")
+        for name in importlib.import_module(package).__all__
+        if name != "tasks"
+    }
+    assert not modules & hidden

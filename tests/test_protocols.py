@@ -11,7 +11,7 @@ import pytest
 import creps_jax
 from creps_jax import tasks
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
-from creps_jax.features import linear_features, quadratic_features, rbf_features
+from creps_jax.policies.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks import Outcome, average_repeats, penalised, sigmoid_constrained, sinus
 from creps_jax.tasks.functions import sphere
 
@@ -134,8 +134,8 @@ def test_rollouts_are_finite_and_repeatable(request, key, task):
 
 IMPORT_ORDERS = {
     "package": "import creps_jax; assert 'mujoco' not in sys.modules; from creps_jax.tasks import nao_walk",
-    "module": "from creps_jax.tasks.nao_walk import nao_walk as f; from creps_jax.tasks import nao_walk",
-    "attribute": "from creps_jax import tasks; nao_walk = tasks.nao_walk; import creps_jax.tasks.nao_walk",
+    "module": "from creps_jax.tasks.walking import nao_walk as f; from creps_jax.tasks import nao_walk",
+    "attribute": "from creps_jax import tasks; nao_walk = tasks.nao_walk; import creps_jax.tasks.walking",
 }
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from creps_jax.archive import push
-from creps_jax.creps import CrepsState, creps
-from creps_jax.features import linear_features
-from creps_jax.policy import LinearGaussian
+from creps_jax.policies.features import linear_features
+from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.rollouts import compiled_roll_out, device_tuple, mean_outcome, replicate
+from creps_jax.search.archive import push
+from creps_jax.search.creps import CrepsState, creps
 from creps_jax.tasks import PlainOutcome, Task
-from creps_jax.train import evaluate, make_iteration, train, train_trials
+from creps_jax.training import evaluate, make_iteration, train, train_trials
 from tests.compilations import count_compilations
 
 FIRST, SECOND = jax.devices()

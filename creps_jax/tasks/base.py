@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from creps_jax import checks, constraints
+from creps_jax import checks
+from creps_jax.policies import space
 from creps_jax.programs import KeepsPrograms
 from creps_jax.typing import Array, Float, PRNGKey, VectorLike
 
@@ -150,7 +151,7 @@ def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
         theta = checks.array("theta", theta, (task.theta_dim,))
-        return task.rollout(key, context, constraints.sigmoid_gate(theta, low, high))
+        return task.rollout(key, context, space.sigmoid_gate(theta, low, high))
 
     return dataclasses.replace(task, rollout=rollout)
 
@@ -180,10 +181,10 @@ def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | in
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
         theta = checks.array("theta", theta, (task.theta_dim,))
-        violation = constraints.violation(theta, low, high)
+        violation = space.violation(theta, low, high)
         outcome = check_outcome(task.rollout(key, context, jnp.clip(theta, low, high)))
         return outcome._replace(
-            reward=outcome.reward - constraints.penalty(violation, penalty), violation=violation
+            reward=outcome.reward - space.penalty(violation, penalty), violation=violation
         )
 
     return dataclasses.replace(task, rollout=rollout, worst_reward=task.worst_reward - penalty)

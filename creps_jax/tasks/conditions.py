@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from creps_jax import checks
-from creps_jax.physics.world import World
+from creps_jax.simulation.world import World
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
 __all__ = [

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 
 from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
-from creps_jax.motion.dmp import DmpTrajectory, dmp_trajectory
 from creps_jax.tasks.base import PlainOutcome, Task
+from creps_jax.tasks.dmp import DmpTrajectory, dmp_trajectory
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar, ScalarLike, VectorLike
 
 __all__ = [

@@ -23,12 +23,12 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from creps_jax.contexts import context_grid, uniform_contexts  # noqa: E402
-from creps_jax.creps import Creps, creps  # noqa: E402
-from creps_jax.features import linear_features  # noqa: E402
-from creps_jax.mstep import bounded_ml, weighted_ml  # noqa: E402
-from creps_jax.policy import LinearGaussian  # noqa: E402
+from creps_jax.policies.features import linear_features  # noqa: E402
+from creps_jax.policies.gaussian import LinearGaussian  # noqa: E402
+from creps_jax.search.creps import Creps, creps  # noqa: E402
+from creps_jax.search.fit import bounded_ml, weighted_ml  # noqa: E402
 from creps_jax.tasks import PlainOutcome, Task  # noqa: E402
-from creps_jax.train import train_trials  # noqa: E402
+from creps_jax.training import train_trials  # noqa: E402
 from experiments import comparison, plots, tables, updates  # noqa: E402
 from experiments.comparison import LearnerSettings, compare, mean_policy_curve  # noqa: E402
 from experiments.results import save_figure  # noqa: E402

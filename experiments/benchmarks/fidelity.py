@@ -17,8 +17,8 @@ from pathlib import Path  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from creps_jax.physics import c  # noqa: E402
-from creps_jax.tasks.nao_walk import load_nao, nao_walk  # noqa: E402
+from creps_jax.simulation import c  # noqa: E402
+from creps_jax.tasks.walking import load_nao, nao_walk  # noqa: E402
 from experiments import tables  # noqa: E402
 from experiments.benchmarks.policy import speeds_of, walk_at_all_speeds  # noqa: E402
 from experiments.errors import UserError  # noqa: E402

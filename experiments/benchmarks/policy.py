@@ -22,8 +22,8 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from creps_jax.tasks import Task  # noqa: E402
-from creps_jax.tasks.nao_walk import WalkNoise, nao_walk  # noqa: E402
-from creps_jax.train import evaluate  # noqa: E402
+from creps_jax.tasks.walking import WalkNoise, nao_walk  # noqa: E402
+from creps_jax.training import evaluate  # noqa: E402
 from experiments import tables  # noqa: E402
 from experiments.errors import UserError  # noqa: E402
 from experiments.policy_file import SavedPolicy  # noqa: E402

@@ -28,9 +28,9 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
-from creps_jax.physics.state import ControlStep, RobotState  # noqa: E402
 from creps_jax.rollouts import roll_out  # noqa: E402
-from creps_jax.tasks.nao_walk import CONTROL_PERIOD, Physics  # noqa: E402
+from creps_jax.simulation.state import ControlStep, RobotState  # noqa: E402
+from creps_jax.tasks.walking import CONTROL_PERIOD, Physics  # noqa: E402
 from experiments import tables  # noqa: E402
 from experiments.benchmarks.rollouts import walking_batch  # noqa: E402
 from experiments.errors import UserError  # noqa: E402

@@ -6,9 +6,9 @@ import resource
 import jax
 import pytest
 
-from creps_jax.features import rbf_features
+from creps_jax.policies.features import rbf_features
 from creps_jax.tasks import hole_reaching, sinus, via_point_reaching
-from creps_jax.train import train_trials
+from creps_jax.training import train_trials
 from experiments import fig05_sinus, fig06_reaching, fig08_hole
 from experiments.comparison import make_contender
 

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from creps_jax.archive import Batch
-from creps_jax.creps import creps
-from creps_jax.dual import sample_weights, solve_dual
-from creps_jax.features import rbf_features
-from creps_jax.mstep import WeightedSamples, bounded_ml, weighted_ml
-from creps_jax.policy import LinearGaussian
+from creps_jax.policies.features import rbf_features
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.search.archive import Batch
+from creps_jax.search.creps import creps
+from creps_jax.search.dual import sample_weights, solve_dual
+from creps_jax.search.fit import WeightedSamples, bounded_ml, weighted_ml
 
 # The size of the hole-reaching task.
 SAMPLES, DIM, CENTERS = 2000, 18, 6

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from creps_jax.features import rbf_grid
+from creps_jax.policies.features import rbf_grid
 from experiments.errors import UserError
 from experiments.policy_file import SavedPolicy
 

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from creps_jax.motion.nao_geometry import JOINT_NAMES
-from creps_jax.motion.walking.params import params_from_theta
-from creps_jax.motion.walking.set_points import open_loop_set_points
-from creps_jax.tasks.nao_walk import CONTROL_PERIOD
+from creps_jax.robots.nao_geometry import JOINT_NAMES
+from creps_jax.tasks.walking import CONTROL_PERIOD
+from creps_jax.walking.params import params_from_theta
+from creps_jax.walking.set_points import open_loop_set_points
 from experiments import tables
 from experiments.errors import UserError
 from experiments.results import save_arrays, save_text

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from creps_jax import policy as gaussian
-from creps_jax.archive import Batch
-from creps_jax.constraints import sigmoid_gate
 from creps_jax.contexts import context_grid
-from creps_jax.creps import Creps, CrepsState, creps
-from creps_jax.features import quadratic_features
-from creps_jax.policy import LinearGaussian
+from creps_jax.policies import gaussian
+from creps_jax.policies.features import quadratic_features
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.space import sigmoid_gate
+from creps_jax.search.archive import Batch
+from creps_jax.search.creps import Creps, CrepsState, creps
 from experiments.errors import UserError
 from experiments.learning import make_m_step
 from experiments.policy_file import SavedPolicy

@@ -8,8 +8,8 @@ from typing import Any, TypeVar
 import jax.numpy as jnp
 import numpy as np
 
-from creps_jax.features import FeatureMap
-from creps_jax.policy import LinearGaussian
+from creps_jax.policies.features import FeatureMap
+from creps_jax.policies.gaussian import LinearGaussian
 from experiments.errors import UserError
 from experiments.policy_file import Features, SavedPolicy
 from experiments.session.plain import shortest

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from creps_jax.archive import push
-from creps_jax.creps import CrepsState, creps
+from creps_jax.search.archive import push
+from creps_jax.search.creps import CrepsState, creps
 from experiments import comparison, registry, walk
 from tests.experiments import tiny as small
 

@@ -14,8 +14,8 @@ import onnx
 import onnxruntime
 import pytest
 
-from creps_jax.motion.nao_geometry import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, MAX_JOINT_SPEED
-from creps_jax.motion.robots import NAO_H25
+from creps_jax.robots.nao_geometry import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, MAX_JOINT_SPEED
+from creps_jax.robots.robot import NAO_H25
 from experiments.cli import main
 from experiments.errors import UserError
 from experiments.export.c_header import make_header

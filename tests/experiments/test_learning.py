@@ -3,11 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.features import linear_features, quadratic_features
-from creps_jax.policy import LinearGaussian
+from creps_jax.policies.features import linear_features, quadratic_features
+from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.tasks import PlainOutcome
-from creps_jax.tasks.nao_walk import WalkOutcome
-from creps_jax.train import Samples
+from creps_jax.tasks.walking import WalkOutcome
+from creps_jax.training import Samples
 from experiments import comparison, learning
 from experiments.learning import Plan, Session, learn, trial_keys
 from tests.experiments.tiny import TASK

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.archive import Batch
-from creps_jax.creps import creps
-from creps_jax.features import rbf_features
-from creps_jax.mstep import bounded_ml
+from creps_jax.policies.features import rbf_features
+from creps_jax.search.archive import Batch
+from creps_jax.search.creps import creps
+from creps_jax.search.fit import bounded_ml
 from experiments import results
 from experiments.cli import main
 from experiments.errors import UserError

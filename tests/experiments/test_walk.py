@@ -10,19 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.motion.robots import NAO, NAO_H25
-from creps_jax.motion.walking.params import (
+from creps_jax.robots.robot import NAO, NAO_H25
+from creps_jax.simulation import c
+from creps_jax.tasks.base import Task
+from creps_jax.tasks.walking import WalkOutcome, nao_walk
+from creps_jax.training import evaluate
+from creps_jax.walking.params import (
     AUTHOR_BOUNDS,
     NAO_BOUNDS,
     NAO_H25_BOUNDS,
     PAPER_BOUNDS,
     PARAM_NAMES,
 )
-from creps_jax.motion.walking.posture import Balance
-from creps_jax.physics import c
-from creps_jax.tasks.base import Task
-from creps_jax.tasks.nao_walk import WalkOutcome, nao_walk
-from creps_jax.train import evaluate
+from creps_jax.walking.posture import Balance
 from experiments import fig11_walk, results, runner, tables, walk, walking_policy
 from experiments.cli import main
 from experiments.errors import UserError
@@ -279,7 +279,9 @@ def test_films_show_six_speeds_of_the_policys_range():
     assert walking_policy.filmed_speeds(h25)[-1] == walker.high
 
 
-@pytest.mark.parametrize(("name", "known"), [("bounds", "nao, nao_h25, paper"), ("physics", "auto, mjx, c")])
+@pytest.mark.parametrize(
+    ("name", "known"), [("bounds", "nao, nao_h25, author, paper"), ("physics", "auto, mjx, c")]
+)
 def test_unknown_names_are_refused(name, known):
     with pytest.raises(UserError, match=f"{name} must be one of {known}, got 'moon'"):
         walk.Settings(**{name: "moon"})

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.physics import c
-from creps_jax.physics.state import initial_state
-from creps_jax.tasks.nao_walk import load_nao
+from creps_jax.simulation import c
+from creps_jax.simulation.state import initial_state
+from creps_jax.tasks.walking import load_nao
 from experiments import walk_inside
 from experiments.errors import UserError
 from experiments.probe import Measured, Probe

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.motion.walking.params import PARAM_NAMES
 from creps_jax.tasks.base import Task
-from creps_jax.tasks.nao_walk import WalkOutcome, WalkRecord
+from creps_jax.tasks.walking import WalkOutcome, WalkRecord
+from creps_jax.walking.params import PARAM_NAMES
 from experiments import results, runner, walk, walk_slope, walking_policy
 from experiments.errors import UserError
 from experiments.policy_file import load_policy, policies_folder

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from creps_jax.creps import creps
-from creps_jax.features import linear_features, quadratic_features
-from creps_jax.policy import LinearGaussian
-from creps_jax.tasks.sinus import sinus
+from creps_jax.policies.features import linear_features, quadratic_features
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.search.creps import creps
+from creps_jax.tasks.sine import sinus
 from experiments import learning, plots, registry
 from experiments.learning import Plan, learn, trial_keys
 from experiments.registry import Claim

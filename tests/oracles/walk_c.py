@@ -4,10 +4,10 @@ import jax
 import mujoco
 import numpy as np
 
-from creps_jax.motion.nao_geometry import MAX_JOINT_SPEED
-from creps_jax.motion.walking.engine import joint_targets, plan_walk
-from creps_jax.motion.walking.params import params_from_theta
-from creps_jax.motion.walking.posture import Balance
+from creps_jax.robots.nao_geometry import MAX_JOINT_SPEED
+from creps_jax.walking.engine import joint_targets, plan_walk
+from creps_jax.walking.params import params_from_theta
+from creps_jax.walking.posture import Balance
 
 CONTROL_PERIOD = 0.02
 NUM_STEPS = 60

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.physics import c
-from creps_jax.physics.world import World, changed_fields, world_of
-from creps_jax.rotations import quat_to_rpy
+from creps_jax.numerics.rotations import quat_to_rpy
+from creps_jax.simulation import c
+from creps_jax.simulation.world import World, changed_fields, world_of
 from creps_jax.tasks.conditions import (
     circumstances_of,
     friction,
@@ -17,8 +17,8 @@ from creps_jax.tasks.conditions import (
     slope_angle,
     upward,
 )
-from creps_jax.tasks.nao_walk import WalkNoise, load_nao, nao_walk, record_walk
-from creps_jax.train import evaluate
+from creps_jax.tasks.walking import WalkNoise, load_nao, nao_walk, record_walk
+from creps_jax.training import evaluate
 from tests.oracles.walk_c import BALANCE
 
 # A gait of about .33 m/s.

@@ -1,1 +1,0 @@
-"""A walking engine with ten parameters (Abdolmaleki et al. 2016, Section 2)."""

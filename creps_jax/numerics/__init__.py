@@ -1,0 +1,1 @@
+"""Numbers: linear algebra, minimisation, rotations, curves."""

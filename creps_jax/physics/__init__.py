@@ -1,1 +1,0 @@
-"""Simulators of robots."""

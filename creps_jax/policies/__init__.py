@@ -1,0 +1,1 @@
+"""What is learned: a distribution of parameters for each context."""

@@ -1,0 +1,178 @@
+"""Describe, sample and fit the upper-level policy: a Gaussian whose mean is linear in context features.
+
+Functions take the features of one context; `jax.vmap` them over a batch.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from creps_jax import checks
+from creps_jax.numerics.linalg import exact_dot, safe_cholesky, safe_sqrt
+from creps_jax.policies.regression import Regression, as_coefficients, regress
+from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike
+
+__all__ = ["LinearGaussian", "entropy", "fit_weighted_ml", "kl", "log_prob", "mean", "sample"]
+
+_LOG_TWO_PI = 1.8378770664093453
+
+
+class LinearGaussian(NamedTuple):
+    """Hold the policy pi(theta | s) = N(theta | coef' varphi(s), cov_chol cov_chol').
+
+    Source: Abdolmaleki et al. 2016, Section 3.1.
+    """
+
+    coef: Float[Array, "p d"]
+    """The coefficients A: one row a feature, one column a parameter."""
+    cov_chol: Float[Array, "d d"]
+    """The lower Cholesky factor of the covariance Sigma; its diagonal is positive."""
+
+
+def mean(policy: LinearGaussian, features: Float[Array, " p"]) -> Float[Array, " d"]:
+    """Return the mean parameters A' varphi(s) for a context.
+
+    Args:
+        policy: The policy.
+        features: Policy features varphi(s) of the context.
+
+    Returns:
+        The mean of theta.
+
+    Raises:
+        ValueError: If the policy has another number of features.
+    """
+    if features.shape != policy.coef.shape[:1]:
+        raise ValueError(f"features have to have shape {policy.coef.shape[:1]}, got {features.shape}")
+    return exact_dot(features, policy.coef)
+
+
+def sample(key: PRNGKey, policy: LinearGaussian, features: Float[Array, " p"]) -> Float[Array, " d"]:
+    """Draw parameters theta ~ pi(theta | s) for a context.
+
+    Args:
+        key: Random key.
+        policy: The policy.
+        features: Policy features varphi(s) of the context.
+
+    Returns:
+        One theta.
+
+    Raises:
+        ValueError: If the policy has another number of features.
+    """
+    centre = mean(policy, features)
+    noise = jax.random.normal(key, centre.shape, centre.dtype)
+    return centre + exact_dot(policy.cov_chol, noise)
+
+
+def log_prob(policy: LinearGaussian, features: Float[Array, " p"], theta: Float[Array, " d"]) -> Scalar:
+    """Return the log density log pi(theta | s).
+
+    Args:
+        policy: The policy.
+        features: Policy features varphi(s) of the context.
+        theta: Parameters.
+
+    Returns:
+        The log density, in nats.
+
+    Raises:
+        ValueError: If the policy has another number of features or parameters.
+    """
+    centre = mean(policy, features)
+    if theta.shape != centre.shape:
+        raise ValueError(f"theta has to have shape {centre.shape}, got {theta.shape}")
+    whitened = jax.scipy.linalg.solve_triangular(policy.cov_chol, theta - centre, lower=True)
+    return -0.5 * jnp.sum(whitened**2) - _half_log_det(policy) - 0.5 * _LOG_TWO_PI * centre.size
+
+
+def kl(policy: LinearGaussian, reference: LinearGaussian, features: Float[Array, " p"]) -> Scalar:
+    """Return the relative entropy KL(policy || reference) of theta for a context.
+
+    Args:
+        policy: The distribution over which the expectation is taken, usually the new policy.
+        reference: The distribution compared with, usually the old policy.
+        features: Policy features varphi(s) of the context.
+
+    Returns:
+        The relative entropy, in nats.
+
+    Raises:
+        ValueError: If the policies differ in shape or have another number of features.
+    """
+    if policy.coef.shape != reference.coef.shape:
+        raise ValueError(f"policies differ in shape: {policy.coef.shape} and {reference.coef.shape}")
+    shift = mean(policy, features) - mean(reference, features)
+    both = jnp.concatenate([policy.cov_chol, shift[:, None]], axis=1)
+    ratio = jax.scipy.linalg.solve_triangular(reference.cov_chol, both, lower=True)
+    log_dets = _half_log_det(reference) - _half_log_det(policy)
+    return 0.5 * (jnp.sum(ratio**2) - shift.size) + log_dets
+
+
+def entropy(policy: LinearGaussian) -> Scalar:
+    """Return the differential entropy of theta, the same for all contexts, in nats."""
+    return _half_log_det(policy) + 0.5 * (1.0 + _LOG_TWO_PI) * policy.cov_chol.shape[0]
+
+
+@checks.arguments
+def fit_weighted_ml(
+    features: Float[Array, "n p"],
+    theta: Float[Array, "n d"],
+    weights: Float[Array, " n"],
+    *,
+    ridge: ScalarLike,
+    scale: Float[Array, " p"] | None = None,
+    start: Float[Array, "p d"] | None = None,
+) -> LinearGaussian:
+    """Fit the policy to weighted samples by maximum likelihood.
+
+    The fit does not depend on the units and zeros of parameters and features. The ridge shrinks the policy
+    towards the weighted mean of theta (as far as the features can express a constant), not towards zero: it
+    penalises how the mean changes with the context. Powers of a context are other features for another zero
+    of the context, and the ridge holds them otherwise: with them, measure the context from the middle of its
+    range, or set the ridge to zero.
+
+    Args:
+        features: Policy features varphi of the context of each sample.
+        theta: Parameters of each sample.
+        weights: Weights d of the samples, not negative; a sample of weight zero may hold anything.
+        ridge: Penalty on the coefficients, but for those that make a constant, relative to the square of
+            each feature's scale; may be zero.
+        scale: Size of each feature, see `weighted_ridge`; by default its standard deviation.
+        start: Coefficients from which the ridge counts, those of the last policy: what a ridge towards a
+            constant takes away in each of many updates adds up. By default that constant.
+
+    Returns:
+        The policy. Its covariance is taken about its own, context-dependent mean, and unbiased however many
+        features the mean has. It is finite and positive definite for any weights: what too few samples leave
+        open is filled in as small as rounding allows.
+
+    Raises:
+        ValueError: If shapes do not fit each other, or a number is out of its range.
+
+    Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
+    """
+    fit = regress(features, theta, weights, ridge=ridge, scale=scale, start=start)  # Eq. 14
+    coef = as_coefficients(fit.basis, fit.solution.at[0].add(fit.centre), fit.size)
+    coef = coef if start is None else start + coef
+    return LinearGaussian(coef, fit.size[:, None] * _weighted_cov_chol(fit))
+
+
+def _weighted_cov_chol(fit: Regression) -> Float[Array, "d d"]:
+    """Return the Cholesky factor of the weighted covariance of residuals, in units of the parameters.
+
+    It is taken of the correlations: what has to be added to make these positive definite is then relative to
+    the spread of each parameter. A parameter without spread gets that of its rounding.
+    """
+    residual = fit.rest - exact_dot(fit.rows, fit.solution)
+    scatter = exact_dot(residual.T, residual) / fit.normaliser  # Eq. 15
+    spread = jnp.maximum(safe_sqrt(jnp.diagonal(scatter)), 4.0 * jnp.finfo(residual.dtype).eps)
+    correlation = scatter / (spread[:, None] * spread[None, :])
+    is_diagonal = jnp.eye(spread.size, dtype=bool)
+    return spread[:, None] * safe_cholesky(jnp.where(is_diagonal, 1.0, correlation))
+
+
+def _half_log_det(policy: LinearGaussian) -> Array:
+    return jnp.sum(jnp.log(jnp.diagonal(policy.cov_chol)))

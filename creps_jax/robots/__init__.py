@@ -1,0 +1,1 @@
+"""The robots: lengths, limits and leg kinematics."""

@@ -1,0 +1,137 @@
+"""Importance weights of archived samples: how much each says about the policy of today."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.special import logsumexp
+
+from creps_jax import checks
+from creps_jax.numerics.linalg import exact_dot
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.typing import Array, Bool, Float, Int, IntScalar
+
+__all__ = ["Importance", "PolicyHistory", "empty_history", "importance_weights", "remember"]
+
+_LEAST_LOG_POWER, _NUM_HALVINGS = -30.0, 25
+"""Where the search for the power that keeps enough effective samples begins, and its bisections."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Importance:
+    """How to weigh archived samples by importance.
+
+    Meant for `bounded_ml`: weights leave fewer effective samples, of which the unbounded fit makes a policy
+    that narrows too soon.
+
+    Attributes:
+        num_policies: Number K of the last policies that are kept. Samples of older ones are left out: an
+            archive of L samples, told N at a time, holds those of L / N policies.
+        least_effective: Effective number of samples that weights have to leave, of those that there are.
+            Where there would be fewer, all weights are raised to the power, from 0 to 1, that leaves as many.
+    """
+
+    num_policies: int = 20
+    least_effective: float = 50.0
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        checks.count("num_policies", self.num_policies)
+        checks.number("least_effective", self.least_effective, least=1.0)
+
+
+class PolicyHistory(NamedTuple):
+    """The last K policies that samples were drawn from: that of iteration t in the place t mod K."""
+
+    coef: Float[Array, "K p d"]
+    cov_chol: Float[Array, "K d d"]
+
+
+def empty_history(policy: LinearGaussian, num_policies: int) -> PolicyHistory:
+    """Make a history whose places all hold this policy; no sample is of it before it is remembered."""
+    return PolicyHistory(*(jnp.broadcast_to(x, (num_policies, *x.shape)) for x in policy))
+
+
+def remember(history: PolicyHistory, policy: LinearGaussian, iteration: IntScalar) -> PolicyHistory:
+    """Put the policy of an iteration in the place of the oldest."""
+    place = iteration % history.coef.shape[0]
+    return PolicyHistory(*(past.at[place].set(new) for past, new in zip(history, policy, strict=True)))
+
+
+def importance_weights(
+    policy: LinearGaussian,
+    history: PolicyHistory,
+    features: Float[Array, "n p"],
+    theta: Float[Array, "n d"],
+    age: Int[Array, " n"],
+    is_valid: Bool[Array, " n"],
+    iteration: IntScalar,
+    *,
+    least_effective: float,
+) -> Float[Array, " n"]:
+    """Weigh samples by the density of a policy over that of the mixture they were drawn from.
+
+    Against the mixture (the balance heuristic) the weight of a sample of this very policy is at most the
+    number of all samples over the number of its own: no sample of an old policy outweighs all others.
+
+    Args:
+        policy: What samples are wanted of, such as the policy that the last ones were drawn from.
+        history: The last K policies, that of `iteration` included.
+        features: Policy features of the contexts.
+        theta: Parameters.
+        age: How many iterations before `iteration` a sample was drawn.
+        is_valid: Which samples count; what the others hold has to be finite.
+        iteration: The number of the last iteration.
+        least_effective: See `Importance`.
+
+    Returns:
+        Weights that sum to one, zero where a sample does not count or its policy is no longer kept; all
+        zero if none does.
+
+    Source: Veach and Guibas 1995, the balance heuristic.
+    """
+    num_policies = history.coef.shape[0]
+    is_counted = is_valid & (age < num_policies)
+    place = (iteration - age) % num_policies
+    drawn = jax.nn.one_hot(place, num_policies, dtype=theta.dtype) * is_counted[:, None].astype(theta.dtype)
+    share = jnp.sum(drawn, axis=0) / jnp.maximum(jnp.sum(drawn), 1.0)
+    # All densities lack the same factor, which no ratio knows.
+    past = jax.vmap(_log_density, (0, 0, None, None))(*history, features, theta)
+    log_mixture = logsumexp(past, axis=0, b=share[:, None])
+    log_ratio = _log_density(*policy, features, theta) - log_mixture
+    log_ratio = jnp.where(is_counted & jnp.isfinite(log_ratio), log_ratio, -jnp.inf)
+    largest = jnp.max(log_ratio)
+    log_ratio = log_ratio - jnp.where(jnp.isfinite(largest), largest, 0.0)
+    return _flattened(log_ratio, least_effective)
+
+
+def _log_density(coef: Array, cov_chol: Array, features: Array, theta: Array) -> Array:
+    # One small inverse and a product: a triangular system for each sample takes many times as long.
+    eye = jnp.eye(len(cov_chol), dtype=cov_chol.dtype)
+    inverse = jax.scipy.linalg.solve_triangular(cov_chol, eye, lower=True)
+    whitened = exact_dot(theta - exact_dot(features, coef), inverse.T)
+    return -0.5 * jnp.sum(whitened**2, axis=1) - jnp.sum(jnp.log(jnp.diagonal(cov_chol)))
+
+
+def _flattened(log_weight: Array, least_effective: float) -> Array:
+    """Return the weights to the largest power, at most 1, that leaves enough effective samples."""
+    is_counted = jnp.isfinite(log_weight)
+
+    def to_the(power: Array) -> Array:
+        weights = jnp.where(is_counted, jnp.exp(power * jnp.where(is_counted, log_weight, 0.0)), 0.0)
+        return weights / jnp.maximum(jnp.sum(weights), 1.0)  # the largest is one, if there is any
+
+    def is_enough(power: Array) -> Array:
+        return least_effective * jnp.sum(to_the(power) ** 2) <= 1.0
+
+    def halve(ends: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        enough = is_enough(jnp.exp(middle))
+        return (jnp.where(enough, middle, low), jnp.where(enough, high, middle)), None
+
+    ends = jnp.full((), _LEAST_LOG_POWER, log_weight.dtype), jnp.zeros((), log_weight.dtype)
+    (log_power, _), _ = lax.scan(halve, ends, length=_NUM_HALVINGS)
+    return to_the(jnp.where(is_enough(jnp.exp(ends[1])), 1.0, jnp.exp(log_power)))

@@ -1,0 +1,1 @@
+"""One control step of a robot, by MJX or by C MuJoCo."""

@@ -1,0 +1,122 @@
+"""See that a MuJoCo model is the one of a robot, whose figures kinematics and engine count on."""
+
+import mujoco
+import numpy as np
+
+from creps_jax import checks
+from creps_jax.robots.nao_geometry import JOINT_NAMES
+from creps_jax.robots.robot import Robot
+from creps_jax.typing import Float
+
+__all__ = ["check_fit"]
+
+_SLACK = 1e-3
+"""How far limits (rad), torques (N m) and places (m) of a model may be from those of its robot."""
+
+
+@checks.arguments
+def check_fit(model: mujoco.MjModel, robot: Robot) -> None:
+    """Refuse a model that is not the robot's.
+
+    Args:
+        model: The model; its first body is the torso.
+        robot: The robot.
+
+    Raises:
+        ValueError: If it is driven by other joints or in another order, a joint cannot go wherever the
+            robot's can, a servo is stronger or weaker, the hips' yaw-pitch is held equal for a robot with a
+            motor for each, or free for one with a single one, or the joints of the legs, or the lowest
+            points of spheres under the feet, are elsewhere at the zero pose.
+    """
+    names = tuple(model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu))
+    if names != JOINT_NAMES:
+        raise ValueError(f"the model's actuators must drive {JOINT_NAMES} in this order, got {names}")
+    _check_limits(model, robot)
+    _check_torques(model, robot)
+    _check_yaw_motors(model, robot)
+    _check_legs(model, robot)
+
+
+def _check_limits(model: mujoco.MjModel, robot: Robot) -> None:
+    limits = zip(JOINT_NAMES, robot.joint_lower, robot.joint_upper, strict=True)
+    for index, (name, low, high) in enumerate(limits):
+        joint, actuator = model.joint(name), model.actuator(index)
+        ranges = [joint.range] * int(joint.limited[0]) + [actuator.ctrlrange] * int(actuator.ctrllimited[0])
+        for lowest, highest in ranges:
+            if lowest > low + _SLACK or highest < high - _SLACK:
+                raise ValueError(
+                    f"the model's {name} must have the range of the robot {robot.name}, {low:.3f} to "
+                    f"{high:.3f} rad, got {lowest:.3f} to {highest:.3f}"
+                )
+
+
+def _check_torques(model: mujoco.MjModel, robot: Robot) -> None:
+    for index, (name, torque) in enumerate(zip(JOINT_NAMES, robot.max_joint_torque, strict=True)):
+        actuator = model.actuator(index)
+        low, high = actuator.forcerange if actuator.forcelimited[0] else (-np.inf, np.inf)
+        if max(abs(low + torque), abs(high - torque)) > _SLACK:
+            raise ValueError(
+                f"the servo of the model's {name} must have the torque of the robot {robot.name}, "
+                f"{-torque:g} to {torque:g} N m, got {low:g} to {high:g}"
+            )
+
+
+def _check_yaw_motors(model: mujoco.MjModel, robot: Robot) -> None:
+    hips = {model.joint(f"{side}_hip_yaw_pitch").id for side in ("left", "right")}
+    is_joint = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_active0 == 1)
+    pairs = zip(model.eq_obj1id[is_joint], model.eq_obj2id[is_joint], strict=True)
+    is_shared = any({int(first), int(second)} == hips for first, second in pairs)
+    if is_shared != robot.has_one_yaw_motor:
+        raise ValueError(
+            f"the model must {'' if robot.has_one_yaw_motor else 'not '}hold left_hip_yaw_pitch and "
+            f"right_hip_yaw_pitch equal: has_one_yaw_motor of the robot {robot.name} is "
+            f"{robot.has_one_yaw_motor}, got {'one' if is_shared else 'no'} such constraint"
+        )
+
+
+def _check_legs(model: mujoco.MjModel, robot: Robot) -> None:
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    for name, place in _leg_joints(robot).items():
+        for side, sign in (("left", 1.0), ("right", -1.0)):
+            expected = place * np.array([1.0, sign, 1.0])
+            found = data.joint(f"{side}_{name}").xanchor - data.xpos[1]
+            if np.abs(found - expected).max() > _SLACK:
+                raise ValueError(
+                    f"the model's {side}_{name} must be where the robot {robot.name} has it, at "
+                    f"{np.round(expected, 4)} m from the torso, got {np.round(found, 4)}"
+                )
+    for side in ("left", "right"):
+        down = _foot_down(model, data, f"{side}_ankle_roll")
+        if down is not None and abs(down - robot.geometry.foot_down) > _SLACK:
+            raise ValueError(
+                f"the model's {side} sole must be as far below the ankle as the robot {robot.name} has it, "
+                f"{robot.geometry.foot_down:g} m, got {down:g}"
+            )
+
+
+def _foot_down(model: mujoco.MjModel, data: mujoco.MjData, ankle: str) -> float | None:
+    """Return how far the spheres that a foot stands on reach below its ankle, m; None without spheres."""
+    is_sole = model.geom_bodyid == model.jnt_bodyid[model.joint(ankle).id]
+    is_sole &= model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    is_sole &= (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+    if not is_sole.any():
+        return None
+    lowest = np.min(data.geom_xpos[is_sole, 2] - model.geom_size[is_sole, 0])
+    return float(data.joint(ankle).xanchor[2] - lowest)
+
+
+def _leg_joints(robot: Robot) -> dict[str, Float[np.ndarray, "3"]]:
+    """Return where the joints of the left leg are in the frame of the torso at the zero pose, m."""
+    g = robot.geometry
+    hip = np.array([g.hip_x, g.hip_y, g.hip_z])
+    knee = hip + np.array([g.thigh_forward, 0.0, -g.thigh_down])
+    ankle = knee - np.array([0.0, 0.0, g.shank_down])
+    return {
+        "hip_yaw_pitch": hip,
+        "hip_roll": hip,
+        "hip_pitch": hip,
+        "knee": knee,
+        "ankle_pitch": ankle,
+        "ankle_roll": ankle - np.array([0.0, 0.0, g.ankle_drop]),
+    }

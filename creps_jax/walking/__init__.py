@@ -1,0 +1,1 @@
+"""The walking engine: from ten parameters to joint angles."""

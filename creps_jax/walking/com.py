@@ -1,0 +1,95 @@
+"""Plan the centre of mass of one step from its ZMP reference: a spring-mass pendulum, solved at once."""
+
+import math
+
+import jax.numpy as jnp
+
+from creps_jax import checks
+from creps_jax.numerics.linalg import thomas_solve
+from creps_jax.typing import Array, Float, Scalar, ScalarLike
+from creps_jax.walking.params import GRAVITY
+
+__all__ = ["com_trajectory", "spring_height", "zmp_of_com"]
+
+
+@checks.arguments
+def spring_height(
+    phase: Float[Array, "*n"], rest_height: Scalar, amplitude: Scalar, duration: Scalar
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """Return height and vertical acceleration of the mass on the spring.
+
+    Args:
+        phase: Time over the duration of a step, t/T.
+        rest_height: Rest height x0, m.
+        amplitude: Amplitude A, m.
+        duration: Duration T of a step, one oscillation, s.
+
+    Returns:
+        Height in m and acceleration in m/s^2.
+
+    Source: Abdolmaleki et al. 2016, Eq. 3 and 4 with phi = 0.
+    """
+    oscillation = amplitude * jnp.cos(2.0 * math.pi * phase)
+    omega = 2.0 * math.pi / duration
+    return rest_height + oscillation, -(omega**2) * oscillation
+
+
+def _neighbour_weight(com_height, com_height_acc, duration):
+    """a(k) = c(k) of Eq. 6, with `g + z''` and the sampling period squared: see Eq. 1 and 5."""
+    period = duration / (com_height.shape[0] - 1)
+    return -com_height / ((GRAVITY + com_height_acc) * period**2)
+
+
+@checks.arguments
+def com_trajectory(
+    zmp: Float[Array, " n"],
+    com_height: Float[Array, " n"],
+    com_height_acc: Float[Array, " n"],
+    start: ScalarLike,
+    end: ScalarLike,
+    duration: ScalarLike,
+) -> Float[Array, " n"]:
+    """Find the horizontal CoM trajectory whose ZMP is the reference, between two given ends.
+
+    The n nodes are equally spaced over the step, the first and last of them at its ends.
+
+    Args:
+        zmp: ZMP reference along one horizontal axis, m. Its two end values are not used.
+        com_height: CoM height above the floor, m; positive.
+        com_height_acc: Vertical CoM acceleration, m/s^2; greater than -g everywhere.
+        start: CoM position at the first node, m.
+        end: CoM position at the last node, m.
+        duration: Duration of the step, s.
+
+    Returns:
+        CoM position at the nodes, m.
+
+    Raises:
+        ValueError: If there are fewer than three nodes or the shapes differ, or a number is out of its range.
+
+    Source: Abdolmaleki et al. 2016, Eq. 1, 5-9, with the signs of Eq. 1.
+    """
+    if len(zmp) < 3:
+        raise ValueError(f"zmp must have three nodes or more, got {len(zmp)}")
+    checks.finite("com_height", com_height, above=0.0)
+    checks.finite("com_height_acc", com_height_acc, above=-GRAVITY)
+    checks.number("duration", duration, above=0.0)
+    weight = _neighbour_weight(com_height, com_height_acc, duration)
+    # First and last row say x(1) = start and x(n) = end.
+    inner = jnp.ones_like(zmp).at[jnp.array([0, -1])].set(0.0)
+    neighbour = weight * inner
+    rhs = zmp.at[0].set(start).at[-1].set(end)
+    checks.finite("zmp", rhs)
+    return thomas_solve(neighbour, 1.0 - 2.0 * neighbour, neighbour, rhs)
+
+
+@checks.arguments
+def zmp_of_com(
+    com: Float[Array, " n"],
+    com_height: Float[Array, " n"],
+    com_height_acc: Float[Array, " n"],
+    duration: ScalarLike,
+) -> Float[Array, " n-2"]:
+    """Return the ZMP of a CoM trajectory at its inner nodes (Abdolmaleki et al. 2016, Eq. 1 and 5)."""
+    weight = _neighbour_weight(com_height, com_height_acc, duration)[1:-1]
+    return com[1:-1] + weight * (com[:-2] - 2.0 * com[1:-1] + com[2:])

@@ -1,0 +1,315 @@
+"""Turn walking parameters into joint targets: plan a step, pose body and joints."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from creps_jax import checks
+from creps_jax.numerics.curves import smooth_step
+from creps_jax.numerics.rotations import rigid_transform, rotation_x, rotation_y, rotation_z
+from creps_jax.robots.nao_geometry import LEFT, RIGHT, leg_indices
+from creps_jax.robots.nao_kinematics import leg_ik
+from creps_jax.robots.robot import NAO, Robot
+from creps_jax.typing import Array, Float, Scalar
+from creps_jax.walking.com import com_trajectory, spring_height
+from creps_jax.walking.footsteps import Footstep, Stance, next_footstep, standing
+from creps_jax.walking.params import WalkParams
+from creps_jax.walking.posture import Balance, corrected_lean
+from creps_jax.walking.swing import swing_pose
+from creps_jax.walking.zmp import zmp_reference
+
+__all__ = [
+    "BodyPose",
+    "StepPlan",
+    "body_pose",
+    "joint_targets",
+    "plan_step",
+    "plan_walk",
+    "pose_at",
+    "pose_joints",
+    "stand_upright",
+]
+
+NUM_NODES = 33
+# Swing of the shoulders against the legs, rad for each metre that the other foot is ahead, and the arms'
+# posture, rad.
+_ARM_SWING = 5.0
+_SHOULDER_PITCH = -1.6
+_SHOULDER_YAW = 0.1
+_ARM_ROLL = 1.57
+_ELBOW = 0.6
+_MAX_HEADING_STEP = 0.15
+# Sideways tilt beyond which a foot is put out no further, rad.
+_MAX_TILT = 0.35
+
+
+class StepPlan(NamedTuple):
+    """All that is planned of one step.
+
+    Attributes:
+        footstep: Where the feet are and go.
+        com: Horizontal CoM position at equally spaced nodes over the step, in the world, m.
+        yaw: Heading of the trunk at the start and the end of the step, rad.
+    """
+
+    footstep: Footstep
+    com: Float[Array, "n 2"]
+    yaw: Float[Array, "2"]
+
+
+class BodyPose(NamedTuple):
+    """Where hips and feet shall be at one time, in the world (m, rad).
+
+    Attributes:
+        hips: Position (x, y, z) and yaw of the middle of the hips.
+        left: Position (x, y, z) and yaw of the left sole, below the ankle.
+        right: That of the right sole.
+        turn: Share of a turn, -.5 to .5, by which the left foot has turned outwards; the right foot has
+            turned by the opposite. It rises while the left foot swings, and falls while the right one does.
+    """
+
+    hips: Float[Array, "4"]
+    left: Float[Array, "4"]
+    right: Float[Array, "4"]
+    turn: Scalar
+
+
+@checks.arguments
+def plan_step(
+    params: WalkParams, stance: Stance, command: Float[Array, "3"], *, robot: Robot = NAO
+) -> tuple[StepPlan, Stance]:
+    """Plan one step: footstep, ZMP reference, CoM trajectory.
+
+    Args:
+        params: Walking parameters.
+        stance: Where the feet stand.
+        command: Wanted displacement (x forward, y left, yaw) of the body in one step, m and rad.
+        robot: Who walks.
+
+    Returns:
+        The plan of the step, and the stance after it.
+
+    Source: Abdolmaleki et al. 2016, Section 2.
+    """
+    footstep, after = next_footstep(params, stance, command, robot=robot)
+    start, end = stance.body, after.body
+    phase = jnp.linspace(0.0, 1.0, NUM_NODES, dtype=command.dtype)
+    share = params.double_support / params.step_duration
+    zmp = zmp_reference(phase, start[:2], footstep.support[:2], end[:2], share)
+    height, height_acc = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
+    com_height = height + (robot.geometry.ankle_height + robot.com_above_hip)
+    solve = jax.vmap(com_trajectory, in_axes=(1, None, None, 0, 0, None), out_axes=1)
+    com = solve(zmp, com_height, height_acc, start[:2], end[:2], params.step_duration)
+    return StepPlan(footstep, com, jnp.stack([start[2], end[2]])), after
+
+
+@checks.arguments
+def plan_walk(
+    params: WalkParams, num_steps: int, command: Float[Array, "3"] | None = None, *, robot: Robot = NAO
+) -> StepPlan:
+    """Plan a walk from standstill.
+
+    Args:
+        params: Walking parameters.
+        num_steps: Number of steps.
+        command: Wanted displacement of the body in one step; straight ahead by `params.step_length` if
+            left out.
+        robot: Who walks.
+
+    Returns:
+        The plans of the steps, stacked along a leading axis.
+    """
+    dtype = params.step_length.dtype
+    if command is None:
+        command = params.step_length * jnp.array([1.0, 0.0, 0.0], dtype)
+
+    def plan_next(stance, _):
+        plan, after = plan_step(params, stance, command, robot=robot)
+        return after, plan
+
+    return lax.scan(plan_next, standing(dtype, robot=robot), length=num_steps)[1]
+
+
+@checks.arguments
+def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar, *, robot: Robot = NAO) -> BodyPose:
+    """Pose hips and feet at one time of a step.
+
+    Args:
+        params: Walking parameters.
+        plan: The plan of the step.
+        phase: Time over the duration of the step, 0 to 1.
+        robot: Who walks.
+
+    Returns:
+        The pose of hips and feet.
+    """
+    phase = jnp.clip(phase, 0.0, 1.0)
+    share = params.double_support / params.step_duration
+    swing_phase = (phase - 0.5 * share) / (1.0 - share)
+    swing, lift = swing_pose(
+        plan.footstep.swing_start, plan.footstep.swing_end, params.swing_height, swing_phase
+    )
+    back = robot.zmp_ahead_of_ankle
+    swing = _above_floor(swing, lift, back)
+    support = _above_floor(plan.footstep.support, jnp.zeros_like(lift), back)
+
+    node = phase * (plan.com.shape[0] - 1)
+    index = jnp.minimum(node.astype(jnp.int32), plan.com.shape[0] - 2)
+    remainder = node - index.astype(node.dtype)
+    com = (1.0 - remainder) * plan.com[index] + remainder * plan.com[index + 1]
+    height, _ = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
+    turned, swung = smooth_step(phase), smooth_step(jnp.clip(swing_phase, 0.0, 1.0))
+    yaw = (1.0 - turned) * plan.yaw[0] + turned * plan.yaw[1]
+    forward = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)])
+    hips = com - robot.com_ahead_of_hip * forward
+    supports_left = plan.footstep.supports_left
+    return BodyPose(
+        hips=jnp.concatenate([hips, jnp.stack([height + robot.geometry.ankle_height, yaw])]),
+        left=jnp.where(supports_left, support, swing),
+        right=jnp.where(supports_left, swing, support),
+        turn=jnp.where(supports_left, 0.5 - swung, swung - 0.5),
+    )
+
+
+@checks.arguments
+def stand_upright(pose: BodyPose, slope: Scalar) -> BodyPose:
+    """Move the hips of a pose to where they stand above the feet as gravity has it.
+
+    Args:
+        pose: A pose planned for level ground, in the frame of the floor.
+        slope: Angle by which the floor rises along x, rad.
+
+    Returns:
+        The pose with the hips farther ahead, by what their height makes of the slope.
+    """
+    ahead = pose.hips[2] * jnp.tan(slope)
+    return pose._replace(hips=pose.hips.at[0].add(ahead))
+
+
+def _above_floor(foot, height, back):
+    """Place the sole below the ankle, so far behind a foot's centre of this planar pose and height."""
+    x, y, yaw = foot
+    return jnp.stack([x - back * jnp.cos(yaw), y - back * jnp.sin(yaw), height, yaw])
+
+
+@checks.arguments
+def pose_joints(
+    params: WalkParams,
+    pose: BodyPose,
+    measured_rpy: Float[Array, "3"],
+    *,
+    balance: Balance = Balance(),
+    robot: Robot = NAO,
+) -> Float[Array, "22"]:
+    """Pose the joints for a body pose and the measured orientation of the trunk.
+
+    Args:
+        params: Walking parameters.
+        pose: Where hips and feet shall be.
+        measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw relative to the planned
+            heading's origin.
+        balance: How steps answer to the measured orientation.
+        robot: Who walks.
+
+    Returns:
+        Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad, within the joint limits.
+
+    Raises:
+        ValueError: If the measured orientation is not finite.
+    """
+    checks.finite("measured_rpy", measured_rpy)
+    intended = jnp.stack([jnp.zeros_like(params.lean), params.lean])
+    roll, pitch = corrected_lean(intended, measured_rpy[:2], params.roll_gain, params.tilt_gain)
+    R_level_trunk = rotation_y(pitch) @ rotation_x(roll)
+    heading_error = jnp.clip(pose.hips[3] - measured_rpy[2], -1.0, 1.0)
+    heading_step = balance.heading_gain * heading_error
+    turn = jnp.clip(heading_step, -_MAX_HEADING_STEP, _MAX_HEADING_STEP) * pose.turn
+    tilt = jnp.clip(measured_rpy[0], -_MAX_TILT, _MAX_TILT)
+    aside = -balance.placement_gain * params.hip_height * tilt
+    aside_left, aside_right = aside * (0.5 + pose.turn), aside * (0.5 - pose.turn)
+    place = partial(_sole_in_torso, pose.hips, R_level_trunk=R_level_trunk, geometry=robot.geometry)
+    left, right = _pose_legs(
+        place(pose.left, turn=turn, aside=aside_left), place(pose.right, turn=-turn, aside=aside_right), robot
+    )
+    ahead = jnp.cos(pose.hips[3]) * (pose.left[0] - pose.right[0]) + jnp.sin(pose.hips[3]) * (
+        pose.left[1] - pose.right[1]
+    )
+    targets = jnp.concatenate([_head_and_arms(0.5 * ahead), left, right])
+    limits = (jnp.asarray(limit, targets.dtype) for limit in (robot.joint_lower, robot.joint_upper))
+    return jnp.clip(targets, *limits)
+
+
+def _pose_legs(T_torso_left, T_torso_right, robot):
+    """Return the joint angles of both legs; where they share a motor, each gives half of the way."""
+    left, right = leg_ik(T_torso_left, LEFT, robot=robot), leg_ik(T_torso_right, RIGHT, robot=robot)
+    if not robot.has_one_yaw_motor:
+        return left, right
+    yaws = [leg_indices(side).start for side in (LEFT, RIGHT)]
+    low, high = max(robot.joint_lower[i] for i in yaws), min(robot.joint_upper[i] for i in yaws)
+    # Within what the joint can do: clipped after `leg_ik`, it would take the soles from their places.
+    shared = jnp.clip(0.5 * (left[0] + right[0]), low, high)
+    return (
+        leg_ik(T_torso_left, LEFT, robot=robot, yaw_pitch=shared),
+        leg_ik(T_torso_right, RIGHT, robot=robot, yaw_pitch=shared),
+    )
+
+
+def _sole_in_torso(hips, sole, *, R_level_trunk, turn, aside, geometry):
+    """Transform a sole from the world into the frame of a trunk that leans about the middle of its hips.
+
+    The sole is turned by `turn` about the hips and put `aside` to the left.
+    """
+    R_trunk_level = R_level_trunk.T
+    R_heading = rotation_z(turn - hips[3])
+    hip_centre = jnp.array([geometry.hip_x, 0.0, geometry.hip_z], hips.dtype)
+    from_hips = R_heading @ (sole[:3] - hips[:3]) + aside * jnp.array([0.0, 1.0, 0.0], hips.dtype)
+    position = R_trunk_level @ from_hips + hip_centre
+    return rigid_transform(R_trunk_level @ R_heading @ rotation_z(sole[3]), position)
+
+
+def _head_and_arms(left_foot_ahead):
+    """Hold the head still and swing each arm against the foot of its side."""
+    swing = _ARM_SWING * left_foot_ahead
+    left = [_SHOULDER_PITCH - swing, _SHOULDER_YAW, -_ARM_ROLL, -_ELBOW]
+    right = [_SHOULDER_PITCH + swing, -_SHOULDER_YAW, _ARM_ROLL, _ELBOW]
+    return jnp.stack([jnp.asarray(angle, left_foot_ahead.dtype) for angle in [0.0, 0.0, *left, *right]])
+
+
+@checks.arguments
+def joint_targets(
+    params: WalkParams,
+    plans: StepPlan,
+    time: Scalar,
+    measured_rpy: Float[Array, "3"],
+    *,
+    balance: Balance = Balance(),
+    robot: Robot = NAO,
+) -> Float[Array, "22"]:
+    """Return the joint targets of a planned walk at a time.
+
+    Args:
+        params: Walking parameters.
+        plans: Plans of the steps, stacked (see `plan_walk`).
+        time: Time since the start of the first step, s; after the last step the robot holds its last pose.
+        measured_rpy: Measured roll, pitch and yaw of the trunk, rad.
+        balance: See `pose_joints`.
+        robot: Who walks.
+
+    Returns:
+        Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad.
+    """
+    pose = pose_at(params, plans, time, robot=robot)
+    return pose_joints(params, pose, measured_rpy, balance=balance, robot=robot)
+
+
+@checks.arguments
+def pose_at(params: WalkParams, plans: StepPlan, time: Scalar, *, robot: Robot = NAO) -> BodyPose:
+    """Return the body pose of a planned walk at a time (see `joint_targets`)."""
+    num_steps = plans.yaw.shape[0]
+    steps = time / params.step_duration
+    index = jnp.clip(jnp.floor(steps), 0.0, num_steps - 1.0)
+    plan = jax.tree.map(lambda leaf: leaf[index.astype(jnp.int32)], plans)
+    return body_pose(params, plan, steps - index, robot=robot)
