@@ -39,7 +39,7 @@ class Settings(LearnerSettings):
     """Settings of the experiment; the unit of parameters, and so of `start_std`, is rad.
 
     Attributes:
-        num_centers: K, along each of the two contexts, as in the paper.
+        num_centers: K, along each of the two contexts; the paper has 2 RBFs and does not say how they lie.
         bandwidth: width sigma of the RBFs, m; as printed its square is (max - min) / K.
     """
 

@@ -67,8 +67,8 @@ PHYSICS = {"auto": _fastest, "mjx": mjx.make_control_step, "c": c.make_control_s
 class Settings:
     """Settings of the experiment.
 
-    The preset `paper` is the paper's protocol, as far as DEVIATIONS.md goes, and `author` the settings of the
-    scripts that its author published.
+    The preset `paper` is the paper's protocol, and `author` has bounds, numbers of samples, KL bound and RBF
+    width of the scripts that its author published; DEVIATIONS.md says what differs.
 
     Attributes:
         robot: who learns to walk, a name in WALKERS.

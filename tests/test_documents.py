@@ -2,6 +2,7 @@
 
 import doctest
 import os
+import re
 from pathlib import Path
 
 import jupytext
@@ -19,6 +20,17 @@ def test_readme_example_runs():
     failed, tried = doctest.testfile(str(ROOT / "README.md"), module_relative=False)
     assert failed == 0
     assert tried >= 10
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "experiments/DEVIATIONS.md"])
+def test_files_that_a_page_names_are_there(page):
+    text = (ROOT / page).read_text()
+    named = set(re.findall(r"`([a-z_]+/[\w/]+\.(?:py|md))`", text))
+    assert named
+    missing = {
+        path for path in named if not ((ROOT / path).is_file() or (ROOT / "creps_jax" / path).is_file())
+    }
+    assert not missing
 
 
 def test_there_are_notebooks():

@@ -66,8 +66,8 @@ AUTHOR_BOUNDS = (
     (0.0, 0.16, 0.02, 0.01, 0.0, 0.0, 0.0, 0.02, 0.0, 0.0),
     (0.01, 0.22, 0.2, 1.8, 5.0, 1.0, 1.0, 0.4, 0.5, 0.2),
 )
-"""Bounds of the experiment scripts that the paper's author published, with the amplitude A limited to 0.01 m,
-where they let it go to 1 m: above, the pendulum's equation is singular for most step durations."""
+"""Bounds of theta in the experiment scripts that the paper's author published, with the amplitude limited to
+0.01 m, as in `NAO_BOUNDS`: the scripts let it go to 1 m."""
 
 NAO_BOUNDS = (
     (0.0, 0.15, 0.02, 0.14, -5.0, 0.0, 0.0, 0.0, 0.0, 0.02),
