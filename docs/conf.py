@@ -6,7 +6,7 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parent
 sys.path[:0] = [str(DOCS), str(DOCS.parent)]
 
-from experiments.process import import_mjx_quietly, prepare  # noqa: E402
+from creps_jax.tools.process import import_mjx_quietly, prepare  # noqa: E402
 
 prepare()
 import_mjx_quietly()

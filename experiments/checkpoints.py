@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments.errors import UserError
-from experiments.results import load_arrays, save_arrays
+from creps_jax.errors import UserError
+from creps_jax.files import load_arrays, save_arrays
 
 _FORMAT = "creps_jax checkpoint 1"
 _STATE, _LOG = "state.", "log."

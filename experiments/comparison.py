@@ -13,11 +13,12 @@ from scipy import stats
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.search.creps import Creps, creps
+from creps_jax.search.fit import fit_within
 from creps_jax.search.importance import Importance
 from creps_jax.tasks.base import Task
+from creps_jax.tools import plots
 from creps_jax.training import evaluate
-from experiments import plots
-from experiments.learning import Plan, Session, learn, make_m_step, trial_keys
+from experiments.learning import Plan, Session, learn, trial_keys
 
 NUM_EVALUATED = 40
 
@@ -81,7 +82,7 @@ def make_contender(
         kl_bound=settings.kl_bound,
         archive_size=settings.archive_size,
         ridge=settings.ridge,
-        m_step=make_m_step(settings.mean_kl_bound, settings.cov_kl_bound),
+        m_step=fit_within(settings.mean_kl_bound, settings.cov_kl_bound),
         significance=settings.significance,
         importance=None if settings.importance_policies is None else Importance(settings.importance_policies),
     )

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from creps_jax.contexts import context_grid
 from creps_jax.policies.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.sine import sinus
-from experiments import plots
+from creps_jax.tools import plots
 from experiments.comparison import (
     LearnerSettings,
     compare,

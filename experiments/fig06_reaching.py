@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from creps_jax.contexts import context_grid, gaussian_contexts, uniform_contexts
 from creps_jax.policies.features import FeatureMap, linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, via_point_movement, via_point_reaching
-from experiments import plots
+from creps_jax.tools import plots
 from experiments.comparison import (
     LearnerSettings,
     compare,

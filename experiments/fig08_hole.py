@@ -11,9 +11,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid
+from creps_jax.errors import UserError
 from creps_jax.policies.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, hole_movement, hole_reaching
-from experiments import plots
+from creps_jax.tools import plots
+from creps_jax.tools.tables import save_table
 from experiments.comparison import (
     Contender,
     LearnerSettings,
@@ -25,10 +27,8 @@ from experiments.comparison import (
     p_value,
     postures,
 )
-from experiments.errors import UserError
 from experiments.learning import Session
 from experiments.registry import Claim
-from experiments.tables import save_table
 
 LOW, HIGH = 1.4, 2.0
 WIDTH, DEPTH = 0.3, 1.0

@@ -9,12 +9,13 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import comparison, plots, walk
+from creps_jax.policies.learned import Features
+from creps_jax.tools import plots
+from creps_jax.tools.tables import PAPER_LINEAR, PAPER_RBF, save_table
+from experiments import comparison, walk
 from experiments.comparison import signed_rank_p
 from experiments.learning import Session
-from experiments.policy_file import Features
 from experiments.registry import Claim
-from experiments.tables import PAPER_LINEAR, PAPER_RBF, save_table
 
 _PAPER = {
     field.name: getattr(walk.SETTINGS["paper"], field.name)

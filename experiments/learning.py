@@ -13,11 +13,9 @@ from rich.console import Console
 
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.search.creps import Creps, CrepsState
-from creps_jax.search.fit import MStep, bounded_ml, weighted_ml
 from creps_jax.tasks.base import Task
 from creps_jax.training import Samples, train_trials
 from experiments.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
-from experiments.errors import UserError
 from experiments.progress import PooledSamples, Progress, Row
 
 _SECONDS_BETWEEN_CHECKPOINTS = 2.0
@@ -69,19 +67,6 @@ class Plan:
 def trial_keys(key: jax.Array, trials: int) -> jax.Array:
     """Return a key for each trial; a trial has the same one however many there are."""
     return jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.arange(trials, dtype=jnp.uint32))
-
-
-def make_m_step(mean_kl_bound: float | None, cov_kl_bound: float | None) -> MStep:
-    """Return the fit of the paper, or the bounded one where settings give its bounds.
-
-    Raises:
-        UserError: if only one of the two is given.
-    """
-    if mean_kl_bound is None and cov_kl_bound is None:
-        return weighted_ml
-    if mean_kl_bound is None or cov_kl_bound is None:
-        raise UserError(f"mean and covariance are bounded both or not: {mean_kl_bound} and {cov_kl_bound}")
-    return bounded_ml(mean_kl_bound=mean_kl_bound, cov_kl_bound=cov_kl_bound)
 
 
 def learn(

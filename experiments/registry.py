@@ -1,13 +1,12 @@
 """List the experiments by name, and load one when it is asked for."""
 
-import difflib
 import importlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol, cast
 
 import numpy as np
 
-from experiments.errors import UserError
+from creps_jax.errors import UserError, suggest
 
 DESCRIPTIONS = {
     "walk": "a NAO learns to walk at the speed you ask for (the main job)",
@@ -94,11 +93,3 @@ def preset_settings(experiment: Experiment, preset: str) -> Any:
     if preset not in experiment.SETTINGS:
         raise UserError(f"unknown preset {preset!r}{suggest(preset, experiment.SETTINGS)}")
     return experiment.SETTINGS[preset]
-
-
-def suggest(name: str, known: Iterable[str]) -> str:
-    """Return how an error about an unknown name goes on: with the nearest one, and all of them."""
-    known = list(known)
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f", did you mean {near[0]!r}?" if near else ","
-    return f"{hint} choose from: {', '.join(known)}"

@@ -11,10 +11,12 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from experiments import folder_lock, registry, results
-from experiments.errors import UserError
+from creps_jax import files
+from creps_jax.errors import UserError
+from creps_jax.tools import folder_lock, plots, results
+from creps_jax.tools.tables import to_markdown
+from experiments import registry
 from experiments.learning import Session
-from experiments.tables import to_markdown
 
 Say = Callable[[str], None]
 
@@ -27,24 +29,54 @@ _PAPERS_ROBOT = "nao"
 
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """What to run; None leaves a choice to the preset or to the run that is resumed.
+    """What to run.
 
     Attributes:
         name: the experiment.
-        preset: a name among its presets.
-        seed: seed of the random key.
-        overrides: settings by name, in place of the preset's.
-        out: the result folder.
-        resume: whether to go on with the run in `out`, or with the latest one that has not finished, of the
-            robot that is asked for, if one is.
+        settings: all its settings, see `default_settings`.
+        preset: the name of the preset that they began with; None is the experiment's first one, or of a run
+            that is resumed its own.
+        config: the manifest that they began with, in place of a preset.
+        seed: seed of the random key; None is that of `config` or of the run that is resumed, or else 0.
+        out: the result folder; None is a new one, or the one of the latest run that has not finished.
+        resume: whether to go on with the run in `out`.
     """
 
     name: str
+    settings: Any
     preset: str | None = None
+    config: Path | None = None
     seed: int | None = None
-    overrides: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     out: Path | None = None
     resume: bool = False
+
+
+def default_settings(
+    experiment: registry.Experiment,
+    name: str,
+    *,
+    preset: str | None = None,
+    config: Path | None = None,
+    out: Path | None = None,
+    resume: bool = False,
+) -> Any:
+    """Return the settings that a run begins with, before any of them is changed.
+
+    Those of the run to resume, or of a manifest, or of a preset, by default the experiment's first one.
+
+    Raises:
+        UserError: if there is none of these, or more than one is asked for.
+    """
+    if config is not None and (preset is not None or resume):
+        raise UserError("--config names all settings of a run: it does not go with --preset and --resume")
+    if resume:
+        return _settings_of(experiment, folder := _folder_to_resume(name, out), results.load_manifest(folder))
+    if config is not None:
+        manifest = results.load_manifest_file(config)
+        if manifest.get("experiment") != name:
+            raise UserError(f"{config} is of {manifest.get('experiment')!r}, expected {name!r}")
+        return _settings_of(experiment, config, manifest)
+    return registry.preset_settings(experiment, preset or next(iter(experiment.SETTINGS)))
 
 
 def run(request: Request, *, console: Console | None, say: Say) -> Path:
@@ -89,14 +121,14 @@ def _run(
 
     def update(status: str) -> None:
         manifest.update(status=status, seconds=round(before + time.monotonic() - begin, 1))
-        results.save_json(folder / results.MANIFEST, manifest)
+        files.save_json(folder / results.MANIFEST, manifest)
 
     manifest["devices"] = [str(device) for device in jax.local_devices()]
     update("running")
     try:
         session = Session(folder, _identity(name, settings, manifest["seed"]), console)
         arrays = experiment.run(settings, jax.random.key(manifest["seed"]), session)
-        results.save_arrays(folder / results.ARRAYS, arrays)
+        files.save_arrays(folder / results.ARRAYS, arrays)
         _draw(experiment, arrays, folder, say)
         if hasattr(experiment, "finish"):
             experiment.finish(settings, arrays, folder, say)  # type: ignore[attr-defined]
@@ -134,7 +166,7 @@ def _help(experiment: registry.Experiment, request: Request) -> Path:
         seed = manifest["seed"]
     else:
         # The first process makes the folder: whether it is there yet says nothing.
-        settings, folder, seed = _settings(experiment, request)[1], None, request.seed or 0
+        (settings, seed), folder = _resolved(request), None
     session = Session(folder, _identity(request.name, settings, seed), is_keeper=False)
     experiment.run(settings, jax.random.key(seed), session)
     return request.out or Path()
@@ -152,7 +184,7 @@ def plot(name: str, folder: Path | None, *, say: Say) -> Path:
     if found != name:
         raise UserError(f"{folder} holds results of {found}, expected those of {name}")
     with _whole_results(folder):
-        _draw(experiment, results.load_arrays(folder / results.ARRAYS), folder, say)
+        _draw(experiment, files.load_arrays(folder / results.ARRAYS), folder, say)
     return folder
 
 
@@ -169,7 +201,7 @@ def check(names: tuple[str, ...], *, say: Say) -> bool:
             say(f"{name}: no results yet (python -m experiments run {name})\n")
             continue
         with _whole_results(folder):
-            rows = claim_rows(registry.load(name), results.load_arrays(folder / results.ARRAYS))
+            rows = claim_rows(registry.load(name), files.load_arrays(folder / results.ARRAYS))
         all_hold &= all(row["holds"] for row in rows)
         say(f"{name}: {folder}\n\n{_claims_table(rows)}")
     return all_hold
@@ -185,20 +217,10 @@ def claim_rows(experiment: registry.Experiment, arrays: Mapping[str, np.ndarray]
     return rows
 
 
-def _settings(experiment: registry.Experiment, request: Request) -> tuple[str, Any]:
-    """Return the preset and the settings of a run from the beginning.
-
-    What they leave to defaults or to the machine is decided here, so that the run, when it is resumed
-    elsewhere or by another version, goes on with the same.
-    """
-    preset = request.preset or next(iter(experiment.SETTINGS))
-    settings = _override(registry.preset_settings(experiment, preset), request)
-    return preset, settings.resolved() if hasattr(settings, "resolved") else settings
-
-
 def _started(experiment: registry.Experiment, request: Request) -> tuple[Any, Path, dict[str, Any]]:
     """Return settings, an empty result folder and a manifest for a run from the beginning."""
-    preset, settings = _settings(experiment, request)
+    settings, seed = _resolved(request)
+    preset = request.preset or ("config" if request.config else next(iter(experiment.SETTINGS)))
     folder = request.out
     if folder is None:
         folder = results.new_folder(results.default_root() / request.name, f"{results.stamp()}-{preset}")
@@ -211,58 +233,76 @@ def _started(experiment: registry.Experiment, request: Request) -> tuple[Any, Pa
     elif folder.exists() and (foreign := [p.name for p in folder.iterdir() if not p.name.startswith(".")]):
         # What is there might have the names of what a run writes.
         raise UserError(f"{folder} holds files of something else, {min(foreign)} for one: name a new folder")
-    return settings, folder, results.make_manifest(request.name, preset, settings, request.seed or 0)
+    return settings, folder, results.make_manifest(request.name, preset, settings, seed)
+
+
+def _resolved(request: Request) -> tuple[Any, int]:
+    """Return settings and seed of a run from the beginning.
+
+    What they leave to defaults or to the machine is decided here, so that the run, when it is resumed
+    elsewhere or by another version, goes on with the same.
+    """
+    settings, seed = request.settings, request.seed
+    _check_counts(settings)
+    if seed is None and request.config is not None:
+        seed = results.load_manifest_file(request.config).get("seed")
+    return settings.resolved() if hasattr(settings, "resolved") else settings, seed or 0
+
+
+def _folder_to_resume(name: str, out: Path | None) -> Path:
+    """Return the folder of a run to go on with: the named one, or that of the latest unfinished run."""
+    if out is not None:
+        return out
+    found = [results.latest_folder(name, status=status) for status in ("running", "interrupted", "failed")]
+    folder = max((path for path in found if path is not None), default=None, key=lambda path: path.name)
+    if folder is None:
+        raise UserError(f"there is no unfinished run of {name} in {results.default_root()}")
+    return folder
 
 
 def _resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Path, dict[str, Any]]:
     """Return settings, folder and manifest of a run to go on with."""
-    folder = request.out
-    if folder is None:
-        robot = request.overrides.get("robot")
-        found = [
-            results.latest_folder(request.name, status=status, robot=robot)
-            for status in ("running", "interrupted", "failed")
-        ]
-        folder = max((path for path in found if path is not None), default=None, key=lambda path: path.name)
-        if folder is None:
-            asked = "" if robot is None else f" with the robot {robot}"
-            raise UserError(
-                f"there is no unfinished run of {request.name}{asked} in {results.default_root()}"
-            )
+    folder = _folder_to_resume(request.name, request.out)
     manifest = results.load_manifest(folder)
     for field, kind in (("seed", int), ("seconds", float | int)):
         if not isinstance(manifest.get(field), kind):
             raise UserError(
                 f"{folder} has no {field} in its manifest, expected a number: it cannot be resumed"
             )
-    for field, asked in (("experiment", request.name), ("preset", request.preset), ("seed", request.seed)):
-        if asked is not None and manifest.get(field) != asked:
-            raise UserError(
-                f"{folder} has {field} {manifest.get(field)!r}, not {asked!r}; leave it out to resume"
-            )
+    before = _settings_of(experiment, folder, manifest)
+    asked = {"experiment": request.name, "preset": request.preset, "seed": request.seed}
+    there = {field: manifest.get(field) for field in asked}
+    names = [field.name for field in dataclasses.fields(before) if field.name != "iterations"]
+    asked |= {name: getattr(request.settings, name) for name in names}
+    there |= {name: getattr(before, name) for name in names}
+    for field, value in asked.items():
+        if value is not None and value != there[field]:
+            raise UserError(f"{folder} has {field} {there[field]!r}, not {value!r}; leave it out to resume")
+    _check_counts(request.settings)
+    manifest["settings"] = dataclasses.asdict(request.settings)
+    return request.settings, folder, manifest
+
+
+def _settings_of(experiment: registry.Experiment, path: Path, manifest: Mapping[str, Any]) -> Any:
+    """Return the settings that a manifest holds."""
     try:
-        settings = experiment.Settings(**_as_tuples(manifest["settings"]))
+        return experiment.Settings(**_as_tuples(manifest["settings"]))
     except TypeError as error:
-        raise UserError(f"{folder} was made with other settings than this version has: {error}") from error
-    for name, asked in request.overrides.items():
-        there = getattr(settings, name, None)
-        if name != "iterations" and asked != there:
-            raise UserError(f"{folder} has {name} {there!r}, not {asked!r}; leave it out to resume")
-    settings = _override(settings, request)
-    manifest["settings"] = dataclasses.asdict(settings)
-    return settings, folder, manifest
+        raise UserError(f"{path} was made with other settings than this version has: {error}") from error
 
 
-def _override(settings: Any, request: Request) -> Any:
-    known = {field.name for field in dataclasses.fields(settings)}
-    for name, value in request.overrides.items():
-        if name not in known:
-            raise UserError(f"{request.name} has no setting {name!r}")
-        if isinstance(value, int) and value < 1:
-            raise UserError(f"{name} must be at least 1, got {value}")
-        if name in _MOST and value > _MOST[name]:
-            raise UserError(f"{name} must be at most {_MOST[name]}, got {value}")
-    return dataclasses.replace(settings, **request.overrides)
+def _check_counts(settings: Any) -> None:
+    """Refuse numbers of something that are below 1, or more than a run can hold."""
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if dataclasses.is_dataclass(value):
+            _check_counts(value)
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, int) and not isinstance(number, bool):
+                if number < 1:
+                    raise UserError(f"{field.name} must be at least 1, got {value}")
+                if number > _MOST.get(field.name, number):
+                    raise UserError(f"{field.name} must be at most {_MOST[field.name]}, got {value}")
 
 
 def _identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
@@ -276,13 +316,13 @@ def _identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
 
 def _draw(experiment: registry.Experiment, arrays: Mapping[str, np.ndarray], folder: Path, say: Say) -> None:
     for name, figure in experiment.plot(arrays).items():
-        results.save_figure(folder / f"{name}.png", figure)
+        plots.save_figure(folder / f"{name}.png", figure)
         say(f"figure: {folder / name}.png")
 
 
 def _save_claims(experiment: registry.Experiment, arrays: Mapping[str, np.ndarray], folder: Path) -> None:
     if experiment.CLAIMS:
-        results.save_text(folder / "claims.md", _claims_table(claim_rows(experiment, arrays)))
+        files.save_text(folder / "claims.md", _claims_table(claim_rows(experiment, arrays)))
 
 
 def _claims_table(rows: list[dict[str, Any]]) -> str:

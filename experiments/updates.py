@@ -22,11 +22,12 @@ from creps_jax.contexts import context_grid
 from creps_jax.policies.features import FeatureMap, linear_features, rbf_features
 from creps_jax.tasks import Task, contextual_function, hole_reaching, sinus, via_point_reaching
 from creps_jax.tasks.functions import ackley, ellipsoid, rastrigin, rosenbrock, sphere
-from experiments import comparison, plots
+from creps_jax.tools import plots
+from creps_jax.tools.tables import save_table
+from experiments import comparison
 from experiments.comparison import Contender, LearnerSettings, compare, make_contender, mean_policy_curve
 from experiments.learning import Session
 from experiments.registry import Claim
-from experiments.tables import save_table
 
 LABELS = {
     "plain": "weighted ML, no archive",

@@ -12,16 +12,23 @@ import mujoco
 import numpy as np
 from matplotlib.figure import Figure
 
+from creps_jax import files
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
+from creps_jax.errors import UserError
 from creps_jax.policies.features import quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.learned import Features, SavedPolicy, save_policy
 from creps_jax.policies.space import sigmoid_gate
 from creps_jax.search.creps import Creps, CrepsState, creps
+from creps_jax.search.fit import fit_within
 from creps_jax.simulation import c, mjx
 from creps_jax.simulation.state import ControlStep
 from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constrained
 from creps_jax.tasks.conditions import Condition
 from creps_jax.tasks.walking import WalkNoise, nao_walk
+from creps_jax.tools import plots, tables
+from creps_jax.tools.play import POLICY, START_UP, filmed_speeds, record, save_film
+from creps_jax.tools.robots import WALKERS, Bounds, Walker, find_walker
 from creps_jax.training import evaluate
 from creps_jax.walking.params import (
     AUTHOR_BOUNDS,
@@ -31,13 +38,8 @@ from creps_jax.walking.params import (
     PARAM_UNITS,
 )
 from creps_jax.walking.posture import Balance
-from experiments import plots, results, tables
-from experiments.errors import UserError
-from experiments.learning import Log, Plan, Session, learn, make_m_step, trial_keys
-from experiments.policy_file import Features, SavedPolicy, save_policy
+from experiments.learning import Log, Plan, Session, learn, trial_keys
 from experiments.registry import Claim
-from experiments.robots import WALKERS, Bounds, Walker, find_walker
-from experiments.walking_policy import POLICY, START_UP, filmed_speeds, record, save_film
 
 BOUNDS = {
     **{name: walker.bounds for name, walker in WALKERS.items()},
@@ -357,7 +359,7 @@ def make_algorithm(settings: Settings) -> Creps:
         baseline,
         kl_bound=settings.kl_bound,
         archive_size=settings.archive_size,
-        m_step=make_m_step(settings.mean_kl_bound, settings.cov_kl_bound),
+        m_step=fit_within(settings.mean_kl_bound, settings.cov_kl_bound),
         significance=settings.significance,
     )
 
@@ -481,8 +483,8 @@ def finish(
     columns = tables.speed_table(
         arrays["speeds"], arrays["reward"][trial], arrays["speed"][trial], arrays["fell"][trial]
     )
-    results.save_text(folder / "table.csv", tables.to_csv(columns))
-    results.save_text(folder / "table.md", tables.to_markdown(columns))
+    files.save_text(folder / "table.csv", tables.to_csv(columns))
+    files.save_text(folder / "table.md", tables.to_markdown(columns))
     say(f"\n{tables.to_markdown(columns)}")
     clips = record(policy, filmed_speeds(policy), seed=0, duration=settings.duration)
     save_film(clips, folder / "walk.mp4", say, robot=settings.walker().robot)

@@ -12,21 +12,21 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from creps_jax.errors import UserError
+from creps_jax.files import policies_folder
 from creps_jax.numerics.rotations import quat_to_rpy
 from creps_jax.robots.nao_geometry import JOINT_NAMES
 from creps_jax.tasks.walking import WalkNoise, record_walk
+from creps_jax.tools import plots
+from creps_jax.tools.play import balance_of, load_walking_policy
+from creps_jax.tools.tables import save_table
 from creps_jax.walking.engine import plan_walk
 from creps_jax.walking.params import params_from_theta
 from creps_jax.walking.posture import Balance
 from creps_jax.walking.zmp import zmp_reference
-from experiments import plots
-from experiments.errors import UserError
 from experiments.learning import Session
-from experiments.policy_file import policies_folder
 from experiments.probe import Measured, Probe
 from experiments.registry import Claim
-from experiments.tables import save_table
-from experiments.walking_policy import balance_of, load_walking_policy
 
 GAITS = {"good": "steps answer to the tilt", "bad": "the same gait, but they do not"}
 KNEE = JOINT_NAMES.index("left_knee")

@@ -13,16 +13,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid
+from creps_jax.errors import UserError
+from creps_jax.files import policies_folder
 from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.learned import Features, load_policy, save_policy
 from creps_jax.tasks.conditions import Condition, slope
+from creps_jax.tools import plots, tables
+from creps_jax.tools.play import POLICY, record, save_film
+from creps_jax.tools.plots import Map
 from creps_jax.walking.params import PARAM_UNITS
-from experiments import plots, tables, walk
-from experiments.errors import UserError
+from experiments import walk
 from experiments.learning import Session
-from experiments.plots import Map
-from experiments.policy_file import Features, load_policy, policies_folder, save_policy
 from experiments.registry import Claim
-from experiments.walking_policy import POLICY, record, save_film
 
 FILMED = ((0.2, -10.0), (0.2, 0.0), (0.2, 10.0), (0.4, -10.0), (0.4, 0.0), (0.4, 10.0))
 GENTLE = 5.0

@@ -27,7 +27,7 @@ from pathlib import Path
 ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
 sys.path.insert(0, str(ROOT))
 
-from experiments.process import prepare
+from creps_jax.tools.process import prepare
 
 prepare()  # It keeps what jax compiles: the next run is quicker.
 
@@ -40,7 +40,7 @@ import creps_jax as cj
 from creps_jax.policies import gaussian
 from creps_jax.search.dual import dual_objective, sample_kl
 from creps_jax.search.fit import WeightedSamples, weighted_ml
-from experiments import plots
+from creps_jax.tools import plots
 
 # %% [markdown]
 # ## One batch, three epsilons

@@ -26,7 +26,7 @@ from pathlib import Path
 ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
 sys.path.insert(0, str(ROOT))
 
-from experiments.process import prepare
+from creps_jax.tools.process import prepare
 
 prepare()  # It keeps what jax compiles: the next run is quicker.
 
@@ -38,7 +38,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import creps_jax as cj
-from experiments.plots import COLOURS
+from creps_jax.tools.plots import COLOURS
 
 # %% [markdown]
 # ## The task, and the building blocks

@@ -28,7 +28,7 @@ from pathlib import Path
 ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
 sys.path.insert(0, str(ROOT))
 
-from experiments.process import import_mjx_quietly, prepare
+from creps_jax.tools.process import import_mjx_quietly, prepare
 
 prepare()  # It keeps what jax compiles: the next run is quicker.
 import_mjx_quietly()
@@ -37,9 +37,9 @@ import_mjx_quietly()
 import matplotlib.pyplot as plt
 import numpy as np
 
-from experiments.plots import PAPER_COLOUR, parameters_against_context
-from experiments.policy_file import load_policy
-from experiments.walking_policy import record
+from creps_jax.policies.learned import load_policy
+from creps_jax.tools.play import record
+from creps_jax.tools.plots import PAPER_COLOUR, parameters_against_context
 
 # %% [markdown]
 # ## The policy
@@ -89,7 +89,7 @@ plt.show()
 # %%
 from IPython.display import Markdown, Video, display
 
-from experiments.video import VideoError, write_video
+from creps_jax.tools.video import VideoError, write_video
 
 try:
     path = ROOT / "results" / "first_walk.mp4"

@@ -27,7 +27,7 @@ from pathlib import Path
 ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
 sys.path.insert(0, str(ROOT))
 
-from experiments.process import prepare
+from creps_jax.tools.process import prepare
 
 prepare()  # It keeps what jax compiles: the next run is quicker.
 
@@ -38,7 +38,7 @@ import numpy as np
 
 import creps_jax as cj
 from creps_jax.tasks.planar_arm import arm_points, hole_movement
-from experiments import plots
+from creps_jax.tools import plots
 
 # %% [markdown]
 # ## Learn, with RBFs and with a line

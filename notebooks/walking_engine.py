@@ -27,7 +27,7 @@ from pathlib import Path
 ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
 sys.path.insert(0, str(ROOT))
 
-from experiments.process import prepare
+from creps_jax.tools.process import prepare
 
 prepare()  # It keeps what jax compiles: the next run is quicker.
 
@@ -37,13 +37,13 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 
+from creps_jax.policies.learned import load_policy
 from creps_jax.robots.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
+from creps_jax.tools.plots import COLOURS
 from creps_jax.walking.com import spring_height, zmp_of_com
 from creps_jax.walking.engine import NUM_NODES, plan_walk, pose_at, pose_joints
 from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS, params_from_theta
 from creps_jax.walking.zmp import zmp_reference
-from experiments.plots import COLOURS
-from experiments.policy_file import load_policy
 
 # %%
 theta = load_policy(ROOT / "models" / "nao" / "policies" / "walk.npz").theta(0.3)

@@ -26,7 +26,7 @@ from pathlib import Path
 ROOT = next(folder for folder in (Path.cwd(), *Path.cwd().parents) if (folder / "pyproject.toml").exists())
 sys.path.insert(0, str(ROOT))
 
-from experiments.process import prepare
+from creps_jax.tools.process import prepare
 
 prepare()  # It keeps what jax compiles: the next run is quicker.
 
@@ -36,8 +36,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import creps_jax as cj
+from creps_jax.tools.plots import COLOURS, PAPER_COLOUR
 from experiments.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
-from experiments.plots import COLOURS, PAPER_COLOUR
 
 # %% [markdown]
 # ## A robot in plain Python

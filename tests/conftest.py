@@ -5,7 +5,7 @@ import io
 import os
 from importlib.metadata import version
 
-from experiments.process import prepare
+from creps_jax.tools.process import prepare
 
 # Two CPU devices, so that sharding is exercised everywhere. Compiling what is small is faster than its cache,
 # and tests compile much and run it little: with fewer optimisations the whole takes a third less time.

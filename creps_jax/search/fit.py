@@ -19,7 +19,7 @@ from creps_jax.policies.gaussian import LinearGaussian, fit_weighted_ml
 from creps_jax.policies.regression import Regression, as_coefficients, coordinates, normaliser, regress
 from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
 
-__all__ = ["MStep", "WeightedSamples", "bounded_ml", "weighted_ml"]
+__all__ = ["MStep", "WeightedSamples", "bounded_ml", "fit_within", "weighted_ml"]
 
 _LOG_MULTIPLIERS = (-12.0, 40.0)
 """Range of the logarithms of the multipliers: below, a bound changes nothing; above, nothing moves."""
@@ -99,6 +99,22 @@ def bounded_ml(
         checks.number(name, bound, above=0.0)
 
     return BoundedML(mean_kl_bound, cov_kl_bound, entropy_loss_bound)
+
+
+def fit_within(mean_kl_bound: float | None, cov_kl_bound: float | None) -> MStep:
+    """Choose the fit by its bounds: `weighted_ml` if both are None, else `bounded_ml`.
+
+    Raises:
+        ValueError: If only one of the two is None.
+    """
+    if mean_kl_bound is None and cov_kl_bound is None:
+        return weighted_ml
+    if mean_kl_bound is None or cov_kl_bound is None:
+        raise ValueError(
+            "mean_kl_bound and cov_kl_bound must be numbers both, or None both, "
+            f"got {mean_kl_bound} and {cov_kl_bound}"
+        )
+    return bounded_ml(mean_kl_bound=mean_kl_bound, cov_kl_bound=cov_kl_bound)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
+from creps_jax.files import models_folder
 from creps_jax.numerics.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
 from creps_jax.robots.nao_geometry import NUM_JOINTS, NaoGeometry
 from creps_jax.robots.robot import NAO, Robot
@@ -150,7 +151,7 @@ def load_nao(robot: Robot = NAO) -> mujoco.MjModel:
         robot: The simulated NAO, or `creps_jax.robots.robot.NAO_H25`, the real one.
 
     Raises:
-        FileNotFoundError: If the model file is in neither place.
+        FileNotFoundError: If the model file is not there.
     """
     spec = mujoco.MjSpec.from_file(str(model_path(robot)))
     spec.compiler.discardvisual = True
@@ -162,15 +163,12 @@ def model_path(robot: Robot) -> Path:
     """Return the file of a robot's model, in the checkout or in the installed package.
 
     Raises:
-        FileNotFoundError: If it is in neither place.
+        FileNotFoundError: If it is not there.
     """
-    package = Path(__file__).resolve().parents[1]
-    folders = (package.parent / "models", package / "models")
-    for folder in folders:
-        path = folder / robot.name / f"{robot.name}.xml"
-        if path.is_file():
-            return path
-    raise FileNotFoundError(f"{robot.name}/{robot.name}.xml is in none of {', '.join(map(str, folders))}")
+    path = models_folder() / robot.name / f"{robot.name}.xml"
+    if not path.is_file():
+        raise FileNotFoundError(f"the model of the robot {robot.name} must be in {path}, which is no file")
+    return path
 
 
 @checks.arguments

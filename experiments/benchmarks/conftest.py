@@ -2,7 +2,7 @@
 
 import os
 
-from experiments.process import prepare
+from creps_jax.tools.process import prepare
 
 os.environ["JAX_COMPILATION_CACHE_DIR"] = ""
 prepare()

@@ -10,7 +10,7 @@ chance in 0.4 % of its episodes, and 0 otherwise. Trade-off: what the evidence t
 (`significance`) costs on test functions and saves in noise, as a figure.
 """
 
-from experiments.process import prepare
+from creps_jax.tools.process import prepare
 
 prepare()
 
@@ -28,10 +28,10 @@ from creps_jax.policies.gaussian import LinearGaussian  # noqa: E402
 from creps_jax.search.creps import Creps, creps  # noqa: E402
 from creps_jax.search.fit import bounded_ml, weighted_ml  # noqa: E402
 from creps_jax.tasks import PlainOutcome, Task  # noqa: E402
+from creps_jax.tools import plots, tables  # noqa: E402
 from creps_jax.training import train_trials  # noqa: E402
-from experiments import comparison, plots, tables, updates  # noqa: E402
+from experiments import comparison, updates  # noqa: E402
 from experiments.comparison import LearnerSettings, compare, mean_policy_curve  # noqa: E402
-from experiments.results import save_figure  # noqa: E402
 
 M_STEPS = {"weighted ML": weighted_ml, "bounded": bounded_ml()}
 NOISE = ((10, 20, 3_000, (60, 100, 200)), (20, 50, 10_000, (200,)))
@@ -103,7 +103,7 @@ def draw_trade_off(rows: dict[str, np.ndarray], path: Path) -> None:
         panel.set_ylabel("log of the spread that is left" if name.startswith("pure noise") else "mean reward")
     for panel in panels[len(rows) :]:
         panel.set_axis_off()
-    save_figure(path, figure)
+    plots.save_figure(path, figure)
 
 
 def log_spread(

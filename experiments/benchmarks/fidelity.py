@@ -6,7 +6,7 @@ The finer one is C MuJoCo with a fifth of the time step and a solver that runs u
 seeds of the noise are used nowhere else. Without a file it is the shipped policy of the robot.
 """
 
-from experiments.process import import_mjx_quietly, prepare
+from creps_jax.tools.process import import_mjx_quietly, prepare
 
 prepare()
 import_mjx_quietly()
@@ -17,12 +17,12 @@ from pathlib import Path  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
+from creps_jax.errors import UserError  # noqa: E402
 from creps_jax.simulation import c  # noqa: E402
 from creps_jax.tasks.walking import load_nao, nao_walk  # noqa: E402
-from experiments import tables  # noqa: E402
+from creps_jax.tools import tables  # noqa: E402
+from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy  # noqa: E402
 from experiments.benchmarks.policy import speeds_of, walk_at_all_speeds  # noqa: E402
-from experiments.errors import UserError  # noqa: E402
-from experiments.walking_policy import balance_of, load_walking_policy, robot_of, shipped_policy  # noqa: E402
 
 SEED = 90_000
 FINER = 5

@@ -7,7 +7,7 @@ Without a file it is the shipped policy of the robot. The last options show what
 answer to a sideways tilt otherwise than those that the policy was learned with, do to it.
 """
 
-from experiments.process import import_mjx_quietly, prepare
+from creps_jax.tools.process import import_mjx_quietly, prepare
 
 prepare()
 import_mjx_quietly()
@@ -21,14 +21,14 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
+from creps_jax.errors import UserError  # noqa: E402
+from creps_jax.policies.learned import SavedPolicy  # noqa: E402
 from creps_jax.tasks import Task  # noqa: E402
 from creps_jax.tasks.walking import WalkNoise, nao_walk  # noqa: E402
+from creps_jax.tools import tables  # noqa: E402
+from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy  # noqa: E402
 from creps_jax.training import evaluate  # noqa: E402
-from experiments import tables  # noqa: E402
-from experiments.errors import UserError  # noqa: E402
-from experiments.policy_file import SavedPolicy  # noqa: E402
 from experiments.walk import NUM_SPEEDS  # noqa: E402
-from experiments.walking_policy import balance_of, load_walking_policy, robot_of, shipped_policy  # noqa: E402
 
 SEEDS = 50
 

@@ -10,7 +10,7 @@ threads over one tells how far this machine scales at all: cores that share a ch
 all are busy. As many walk at once as in an iteration of the preset `quick`.
 """
 
-from experiments.process import import_mjx_quietly, prepare, usable_cores
+from creps_jax.tools.process import import_mjx_quietly, prepare, usable_cores
 
 prepare()
 import_mjx_quietly()

@@ -7,7 +7,7 @@ device of several has its share of the cores for C MuJoCo, too. The time without
 rollouts where the robot is not stepped: planning, controller and noise.
 """
 
-from experiments.process import import_mjx_quietly, prepare, usable_cores
+from creps_jax.tools.process import import_mjx_quietly, prepare, usable_cores
 
 prepare()
 import_mjx_quietly()
@@ -28,12 +28,12 @@ import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
+from creps_jax.errors import UserError  # noqa: E402
 from creps_jax.rollouts import roll_out  # noqa: E402
 from creps_jax.simulation.state import ControlStep, RobotState  # noqa: E402
 from creps_jax.tasks.walking import CONTROL_PERIOD, Physics  # noqa: E402
-from experiments import tables  # noqa: E402
+from creps_jax.tools import tables  # noqa: E402
 from experiments.benchmarks.rollouts import walking_batch  # noqa: E402
-from experiments.errors import UserError  # noqa: E402
 from experiments.walk import PHYSICS, TIMESTEP  # noqa: E402
 
 SIZES = (32, 128, 512, 2048, 4096)

@@ -9,11 +9,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from experiments import results, walk
+from creps_jax import files
+from creps_jax.tools import results
+from creps_jax.tools.cli import main as tools
+from creps_jax.tools.session import plain, storage
+from creps_jax.tools.session.settings import Settings
+from experiments import walk
 from experiments.cli import main
-from experiments.session import plain, storage
-from experiments.session.settings import Settings
-from tests.experiments.test_robot_session import DEFINITION, fill
+from tests.tools.test_robot_session import DEFINITION, fill
 
 Mistake = tuple[list[str], str]
 """The arguments, and what of them the error has to show."""
@@ -62,30 +65,31 @@ COMMANDS = {
         option("run", "walk", "--physics", values=NO_NAMES),
         option("run", "walk", "--robot", values=NO_NAMES),
         option("run", "tiny", "--robot", values=st.just("nao_h25")).map(lambda it: (it[0], "--robot")),
+        option("run", "tiny", "--speeds", values=WORDS),
+        option("run", "walk", "--features.num-centers", values=NO_COUNTS),
     ),
     "run --resume": st.one_of(
         option("run", "tiny", "--resume", "--out", values=NO_RESULTS),
         option("run", "tiny", "--resume", "--out", "cut", "--seed", values=st.integers(1, 5).map(str)),
     ),
-    "run --speed": st.one_of(
-        option("run", "walk", "--policy", "whole.npz", "--speed", values=NO_SPEEDS),
-        option("run", "walk", "--speed", "0.3", "--policy", values=NO_POLICIES),
-        option("run", "walk", "--speed", "0.3", "--policy", "whole.npz", "--seed", values=NO_SEEDS),
-        option("run", "walk", "--speed", "0.3", "--policy", "whole.npz", "--out", values=NO_FOLDERS),
-        option("run", "walk", "--speed", "0.3", "--policy", "whole.npz", "--robot", values=NO_ROBOTS),
+    "run --config": st.one_of(
+        option("run", "tiny", "--config", values=NO_DEFINITIONS),
+        option("run", "tiny", "--config", "lacking/manifest.json", "--preset", values=st.just("long")).map(
+            lambda it: (it[0], "--preset")
+        ),
     ),
     "plot": st.one_of(
         option("plot", values=NO_NAMES),
         option("plot", "tiny", "--folder", values=NO_RESULTS),
     ),
     "check": option("check", values=NO_NAMES),
-    "video": st.one_of(
-        option("video", "--policy", "whole.npz", "--speeds", values=NO_SPEEDS),
-        option("video", "--policy", values=NO_POLICIES),
-        option("video", "--policy", "whole.npz", "--seed", values=NO_SEEDS),
-        option("video", "--policy", "whole.npz", "--out", values=NO_VIDEOS),
-        option("video", "--policy", "whole.npz", "--robot", values=NO_ROBOTS),
-        st.integers(25, 1000).map(lambda num: (["video", "--speeds", *["0.3"] * num], str(num))),
+    "play": st.one_of(
+        option("play", "--policy", "whole.npz", "--speed", values=NO_SPEEDS),
+        option("play", "--policy", values=NO_POLICIES),
+        option("play", "--policy", "whole.npz", "--seed", values=NO_SEEDS),
+        option("play", "--policy", "whole.npz", "--out", values=NO_VIDEOS),
+        option("play", "--policy", "whole.npz", "--robot", values=NO_ROBOTS),
+        st.integers(25, 1000).map(lambda num: (["play", "--speed", *["0.3"] * num], str(num))),
     ),
     "export": st.one_of(
         option("export", "--to", values=NO_EXPORTS),
@@ -134,15 +138,15 @@ def folder(tiny):
     policy = walk.saved_policy(quick, walk.first_policy(quick))
     walk.save_policy(Path("whole.npz"), policy)
     Path("cut.npz").write_bytes(Path("whole.npz").read_bytes()[:-100])
-    arrays = results.load_arrays(Path("whole.npz"))
-    results.save_arrays(Path("nan.npz"), {**arrays, "coef": arrays["coef"] * float("nan")})
-    results.save_arrays(Path("reversed.npz"), {**arrays, "param_bounds": arrays["param_bounds"][::-1]})
+    arrays = files.load_arrays(Path("whole.npz"))
+    files.save_arrays(Path("nan.npz"), {**arrays, "coef": arrays["coef"] * float("nan")})
+    files.save_arrays(Path("reversed.npz"), {**arrays, "param_bounds": arrays["param_bounds"][::-1]})
     manifest = results.make_manifest("tiny", "quick", tiny.SETTINGS["quick"], seed=0)
     for name, experiment, text in (("cut", "tiny", b"PK"), ("other", "walk", b""), ("lacking", "tiny", None)):
         Path(name).mkdir()
-        results.save_json(Path(name) / results.MANIFEST, {**manifest, "experiment": experiment})
+        files.save_json(Path(name) / results.MANIFEST, {**manifest, "experiment": experiment})
         if text is None:
-            results.save_arrays(Path(name) / results.ARRAYS, {"something": 1.0})
+            files.save_arrays(Path(name) / results.ARRAYS, {"something": 1.0})
         else:
             (Path(name) / results.ARRAYS).write_bytes(text)
     make_sessions()
@@ -154,7 +158,7 @@ def folder(tiny):
 def make_sessions():
     """Make a session of three trials, one whose trials are of other settings, and one that is cut short."""
     Path("arm.json").write_text(json.dumps(DEFINITION))
-    results.save_json(Path("manifest.json"), {"experiment": "tiny"})
+    files.save_json(Path("manifest.json"), {"experiment": "tiny"})
     settings = plain.read(Settings, DEFINITION, "DEFINITION")
     for name in ("arm", "other-arm", "cut-arm"):
         storage.create(Path(name), settings)
@@ -174,7 +178,7 @@ def run(arguments: list[str]) -> tuple[int, str]:
     output = io.StringIO()
     with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
         try:
-            code = main(arguments)
+            code = (tools if arguments[0] in ("play", "export", "session") else main)(arguments)
         except SystemExit as error:  # as the parser ends
             code = error.code
     return code, output.getvalue()
@@ -208,10 +212,10 @@ def test_mistakes_get_one_clear_error_and_change_nothing(folder, command):
 def test_results_that_are_cut_short_fail_the_check(tiny):
     folder = Path("results/tiny/one")
     manifest = results.make_manifest("tiny", "quick", tiny.SETTINGS["quick"], seed=0)
-    results.save_json(folder / results.MANIFEST, {**manifest, "status": "finished"})
+    files.save_json(folder / results.MANIFEST, {**manifest, "status": "finished"})
     for arrays, message in ((b"PK", "it is cut short"), (None, "lacks 'reward'")):
         if arrays is None:
-            results.save_arrays(folder / results.ARRAYS, {"something": 1.0})
+            files.save_arrays(folder / results.ARRAYS, {"something": 1.0})
         else:
             (folder / results.ARRAYS).write_bytes(arrays)
         code, output = run(["check", "tiny"])

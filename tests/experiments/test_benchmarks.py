@@ -4,9 +4,9 @@ import contextlib
 
 import pytest
 
+from creps_jax.errors import UserError
 from experiments.benchmarks import scaling
 from experiments.benchmarks.scaling import Case, Measured
-from experiments.errors import UserError
 
 IT = Measured(
     compiling=14.6,

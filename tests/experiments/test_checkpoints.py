@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import results
+from creps_jax import files
+from creps_jax.errors import UserError
 from experiments.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
-from experiments.errors import UserError
 
 
 class Inner(NamedTuple):
@@ -68,5 +68,5 @@ def test_bad_checkpoints_are_refused_and_left_alone(tmp_path):
     refused(r"expected float32\(5,\) for state.mean", template=make_state()._replace(mean=jnp.zeros(5)))
     path.write_bytes(whole[: len(whole) // 2])
     refused("cut short")
-    results.save_arrays(path, {"a": np.ones(3)})
+    files.save_arrays(path, {"a": np.ones(3)})
     refused("no checkpoint of this program")

@@ -7,8 +7,8 @@ import jax
 import numpy as np
 import pytest
 
+from creps_jax.errors import UserError
 from experiments import comparison, fig08_hole, updates
-from experiments.errors import UserError
 from experiments.fig08_hole import Settings as HoleSettings
 from experiments.learning import Session
 

@@ -1,17 +1,24 @@
+import dataclasses
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from experiments import folder_lock, learning, registry, results, runner
+from creps_jax import files
+from creps_jax.errors import UserError
+from creps_jax.tools import folder_lock, results
+from experiments import learning, registry, runner
 from experiments.cli import main
-from experiments.errors import UserError
 from experiments.runner import Request
 
 
-def run(said=None, **request):
-    return runner.run(Request("tiny", **request), console=None, say=(said if said is not None else []).append)
+def run(said=None, changes=None, **request):
+    begin = {name: value for name, value in request.items() if name != "seed"}
+    settings = runner.default_settings(registry.load("tiny"), "tiny", **begin)
+    settings = dataclasses.replace(settings, **(changes or {}))
+    said = [] if said is None else said
+    return runner.run(Request("tiny", settings, **request), console=None, say=said.append)
 
 
 def interrupt_after(monkeypatch, iterations: int, error: BaseException) -> None:
@@ -31,7 +38,7 @@ def test_a_run_leaves_arrays_manifest_figure_and_claims(tiny):
     assert folder.parent == Path("results/tiny")
     names = {path.name for path in folder.iterdir()}
     assert names == {"arrays.npz", "manifest.json", "curve.png", "claims.md", "checkpoint-tiny.npz"}
-    arrays = results.load_arrays(folder / "arrays.npz")
+    arrays = files.load_arrays(folder / "arrays.npz")
     assert arrays["reward"].shape == (2, 4)
     assert arrays["coef"].shape == (2, 4, 2, 1)
     manifest = results.load_manifest(folder)
@@ -40,15 +47,15 @@ def test_a_run_leaves_arrays_manifest_figure_and_claims(tiny):
     assert results.latest_folder("tiny", status="finished") == folder
 
 
-def test_overrides_take_the_place_of_settings(tiny):
-    folder = run(overrides={"iterations": 2, "trials": 2}, out=Path("here"))
-    assert results.load_arrays(folder / "arrays.npz")["reward"].shape == (2, 2)
+def test_changed_settings_are_kept(tiny):
+    folder = run(changes={"iterations": 2, "trials": 2}, out=Path("here"))
+    assert files.load_arrays(folder / "arrays.npz")["reward"].shape == (2, 2)
     assert results.load_manifest(folder)["settings"]["iterations"] == 2
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), UserError("disk full"), RuntimeError("bug")])
 def test_a_run_that_stopped_goes_on_with_the_same_numbers(tiny, monkeypatch, error):
-    whole = results.load_arrays(run() / "arrays.npz")
+    whole = files.load_arrays(run() / "arrays.npz")
     said = []
     with monkeypatch.context() as patch, pytest.raises(type(error)):
         interrupt_after(patch, 2, error)
@@ -56,7 +63,7 @@ def test_a_run_that_stopped_goes_on_with_the_same_numbers(tiny, monkeypatch, err
     status = results.load_manifest(Path("part"))["status"]
     assert status == ("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
     assert not isinstance(error, KeyboardInterrupt) or "--resume --out part" in said[-1]
-    resumed = results.load_arrays(run(out=Path("part"), resume=True) / "arrays.npz")
+    resumed = files.load_arrays(run(out=Path("part"), resume=True) / "arrays.npz")
     for name, values in whole.items():
         np.testing.assert_array_equal(resumed[name], values)
     assert results.load_manifest(Path("part"))["status"] == "finished"
@@ -70,10 +77,10 @@ def test_a_run_that_is_running_is_not_joined(tiny):
 
 
 def test_where_folders_cannot_be_locked_a_run_goes_on(tiny, monkeypatch):
-    def refuse(*_):
+    def refuse(*_, **__):
         raise OSError("no locks here")
 
-    monkeypatch.setattr(folder_lock.fcntl, "flock", refuse)
+    monkeypatch.setattr(folder_lock.filelock.FileLock, "acquire", refuse)
     assert results.load_manifest(run())["status"] == "finished"
 
 
@@ -82,11 +89,11 @@ def test_resume_finds_the_latest_unfinished_run_and_can_lengthen_it(tiny, monkey
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         interrupt_after(patch, 1, KeyboardInterrupt())
         run()
-    folder = run(resume=True, overrides={"iterations": 6})
-    longer = results.load_arrays(folder / "arrays.npz")
+    folder = run(resume=True, changes={"iterations": 6})
+    longer = files.load_arrays(folder / "arrays.npz")
     assert longer["reward"].shape == (2, 6)
     np.testing.assert_array_equal(
-        longer["reward"], results.load_arrays(run(preset="long") / "arrays.npz")["reward"]
+        longer["reward"], files.load_arrays(run(preset="long") / "arrays.npz")["reward"]
     )
     with pytest.raises(UserError, match="no unfinished run"):
         run(resume=True)
@@ -105,7 +112,7 @@ def test_a_checkpoint_that_is_cut_short_is_named_and_left_alone(tiny, monkeypatc
 
 
 def test_mistakes_in_a_request_are_named_and_change_nothing(tiny):
-    folder = run(overrides={"iterations": 1}, out=Path("done"))
+    folder = run(changes={"iterations": 1}, out=Path("done"))
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     Path("file").write_text("")
     Path("empty").mkdir()
@@ -115,10 +122,12 @@ def test_mistakes_in_a_request_are_named_and_change_nothing(tiny):
         ("file is a file", {"out": Path("file")}),
         ("empty is no result folder", {"out": Path("empty"), "resume": True}),
         ("has seed 0, not 5", {"out": Path("done"), "resume": True, "seed": 5}),
-        ("trials 2, not 3", {"out": Path("done"), "resume": True, "overrides": {"trials": 3}}),
+        ("trials 2, not 3", {"out": Path("done"), "resume": True, "changes": {"trials": 3}}),
         ("has preset 'quick', not 'long'", {"out": Path("done"), "resume": True, "preset": "long"}),
-        ("iterations must be at least 1, got 0", {"overrides": {"iterations": 0}}),
-        ("tiny has no setting 'samples'", {"overrides": {"samples": 3}}),
+        ("iterations must be at least 1, got 0", {"changes": {"iterations": 0}}),
+        ("trials must be at most 1000, got 1001", {"changes": {"trials": 1001}}),
+        ("none.json", {"config": Path("none.json")}),
+        ("does not go with --preset", {"config": Path("done/manifest.json"), "preset": "long"}),
     ):
         with pytest.raises(UserError, match=match):
             run(**request)
@@ -127,7 +136,7 @@ def test_mistakes_in_a_request_are_named_and_change_nothing(tiny):
 
 
 def test_settings_of_another_version_are_named(tiny):
-    folder = run(overrides={"iterations": 1}, out=Path("done"))
+    folder = run(changes={"iterations": 1}, out=Path("done"))
     manifest = results.load_manifest(folder)
     (folder / "manifest.json").write_text(json.dumps({**manifest, "settings": {"foo": 1}}))
     with pytest.raises(UserError, match="other settings"):
@@ -136,7 +145,7 @@ def test_settings_of_another_version_are_named(tiny):
 
 def test_plot_and_check_use_the_latest_results(tiny, capsys):
     assert main(["plot", "tiny"]) == 2
-    folder = run(overrides={"iterations": 1})
+    folder = run(changes={"iterations": 1})
     (folder / "curve.png").unlink()
     assert main(["plot", "tiny"]) == 0
     assert (folder / "curve.png").exists()
@@ -154,6 +163,23 @@ def test_the_command_runs_resumes_and_reports_mistakes(tiny, capsys, monkeypatch
     assert "iteration 4/4" in capsys.readouterr().out
     assert main(["run", "tiny", "--out", "part"]) == 2
     assert capsys.readouterr().err.startswith("error: part holds a run already")
+
+
+def test_every_setting_is_an_option_and_a_manifest_runs_a_run_again(tiny, capsys):
+    options = ["--preset", "long", "--trials", "1", "--speeds", "0.3", "0.4", "--seed", "7"]
+    assert main(["run", "tiny", *options, "--out", "first"]) == 0
+    first = results.load_manifest(Path("first"))
+    assert first["settings"] == {"iterations": 6, "trials": 1, "speeds": [0.3, 0.4]}
+    assert main(["run", "tiny", "--config", "first/manifest.json", "--out", "again"]) == 0
+    again = results.load_manifest(Path("again"))
+    assert (again["settings"], again["seed"], again["preset"]) == (first["settings"], 7, "config")
+    one, other = (files.load_arrays(Path(name) / "arrays.npz") for name in ("first", "again"))
+    np.testing.assert_array_equal(one["reward"], other["reward"])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stop:
+        main(["run", "tiny", "--trails", "1"])
+    assert stop.value.code == 2
+    assert "--trials" in capsys.readouterr().err
 
 
 def test_all_runs_every_figure_in_a_folder_of_its_own(tiny, monkeypatch):

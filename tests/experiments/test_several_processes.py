@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.results import load_arrays
+from creps_jax.files import load_arrays
 
 ROOT = Path(__file__).parents[2]
 DEADLINE = 300.0

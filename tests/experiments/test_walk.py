@@ -10,10 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from creps_jax import files
+from creps_jax.errors import UserError
+from creps_jax.policies.learned import load_policy
 from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.simulation import c
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.walking import WalkOutcome, nao_walk
+from creps_jax.tools import play, results, tables
+from creps_jax.tools.cli import main as tools
+from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy
+from creps_jax.tools.robots import WALKERS
+from creps_jax.tools.video import Clip, VideoError
 from creps_jax.training import evaluate
 from creps_jax.walking.params import (
     AUTHOR_BOUNDS,
@@ -23,13 +31,8 @@ from creps_jax.walking.params import (
     PARAM_NAMES,
 )
 from creps_jax.walking.posture import Balance
-from experiments import fig11_walk, results, runner, tables, walk, walking_policy
+from experiments import fig11_walk, runner, walk
 from experiments.cli import main
-from experiments.errors import UserError
-from experiments.policy_file import load_policy
-from experiments.robots import WALKERS
-from experiments.video import Clip, VideoError
-from experiments.walking_policy import balance_of, load_walking_policy, robot_of, shipped_policy
 
 SHIPPED = shipped_policy()
 
@@ -54,9 +57,9 @@ def bench(tmp_path, monkeypatch):
     clips = [Clip("asked 0.30 m/s, reached 0.30 m/s", np.zeros((5, 29)), 0.02)]
     settings = walk.Settings(iterations=2, trials=2, eval_seeds=3, first_samples=30, samples=30)
     monkeypatch.setattr(walk, "nao_walk", stand_in)
-    for module in (walk, walking_policy):
+    for module in (walk, play):
         monkeypatch.setattr(module, "record", lambda policy, speeds, **_: (policy.theta(speeds[0]), clips)[1])
-    monkeypatch.setattr(walking_policy, "write_video", lambda path, *_, **__: filmed.append(path))
+    monkeypatch.setattr(play, "write_video", lambda path, *_, **__: filmed.append(path))
     monkeypatch.setattr(walk, "SETTINGS", {"quick": settings})
     monkeypatch.chdir(tmp_path)
     return filmed
@@ -68,7 +71,7 @@ def test_the_result_folder_is_complete(bench):
     figures = "learning_curve.png parameters.png speed.png updates.png"
     assert {path.name for path in folder.iterdir()} == {*files.split(), *figures.split()}
     assert bench == [folder / "walk.mp4"]
-    arrays = results.load_arrays(folder / "arrays.npz")
+    arrays = files.load_arrays(folder / "arrays.npz")
     assert arrays["reward"].shape == (2, 11, 3)
     assert arrays["speed"].shape == (2, 11, 3, 2)
     assert arrays["fine_theta"].shape == (2, 51, 10)
@@ -85,9 +88,9 @@ def test_the_result_folder_is_complete(bench):
     assert rows[0]["paper RBF"] == "-0.166"
 
     said = []
-    walking_policy.show(0.3, None, out=None, seed=0, say=said.append)
+    play.show([0.3], None, out=Path("results/walk.mp4"), seed=0, say=said.append)
     assert said[0] == f"policy: {folder / 'policy.npz'}"
-    assert said[-1] == "video: results/walk/walk-0.30.mp4"
+    assert said[-1] == "video: results/walk.mp4"
 
 
 def test_the_policy_is_kept_that_walks_best_in_the_noise_of_learning(bench, monkeypatch):
@@ -153,25 +156,24 @@ def test_a_penalised_search_starts_where_a_squashed_one_does():
 
 
 def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
-    monkeypatch.setattr(walking_policy, "policies_folder", lambda robot: Path("none"))
+    monkeypatch.setattr(play, "policies_folder", lambda robot: Path("none"))
     Path("bad.npz").write_text("no policy")
     for match, arguments in (
-        ("no policy has been learned yet", ["run", "walk", "--speed", "0.3"]),
-        ("yet: python -m experiments run walk --robot nao_h25 --", ["video", "--robot", "nao_h25"]),
+        ("no policy has been learned yet", ["play", "--speed", "0.3"]),
+        ("yet: python -m experiments run walk --robot nao_h25 --", ["play", "--robot", "nao_h25"]),
         ("unknown robot 'nao_h26', did you mean 'nao_h25'?", ["run", "walk", "--robot", "nao_h26"]),
-        ("--robot goes with walk, not with fig11_walk", ["run", "fig11_walk", "--robot", "nao_h25"]),
-        ("cannot read bad.npz", ["run", "walk", "--speed", "0.3", "--policy", "bad.npz"]),
-        ("no such file: none.npz", ["video", "--policy", "none.npz"]),
+        ("cannot read bad.npz", ["play", "--speed", "0.3", "--policy", "bad.npz"]),
+        ("no such file: none.npz", ["play", "--policy", "none.npz"]),
     ):
-        assert main(arguments) == 2
+        assert (main if arguments[0] == "run" else tools)(arguments) == 2
         error = capsys.readouterr().err
         assert match in error
         assert len(error.splitlines()) == 1
     settings = walk.SETTINGS["quick"]
     walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
-    assert main(["run", "walk", "--speed", "0.9", "--policy", "p.npz"]) == 2
+    assert tools(["play", "--speed", "0.9", "--policy", "p.npz"]) == 2
     assert "within the learned range, 0.1 to 0.6 m/s, got 0.9" in capsys.readouterr().err
-    assert main(["run", "walk", "--speed", "0.5", "--policy", "p.npz"]) == 0
+    assert tools(["play", "--speed", "0.5", "--policy", "p.npz"]) == 0
 
 
 @pytest.mark.parametrize("task", [{"heading_gain": 0.3}, {"balance": {"ankle": 1.0}}, {"balance": None}])
@@ -189,10 +191,10 @@ def test_a_machine_without_opengl_only_lacks_the_video(bench, monkeypatch):
     def fail(*_, **__):
         raise VideoError("no video: OpenGL is not to be had; apt-get install ...")
 
-    monkeypatch.setattr(walking_policy, "write_video", fail)
+    monkeypatch.setattr(play, "write_video", fail)
     settings, said = walk.SETTINGS["quick"], []
     walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
-    walking_policy.show(0.3, Path("p.npz"), out=None, seed=0, say=said.append)
+    play.show([0.3], Path("p.npz"), out=Path("walk.mp4"), seed=0, say=said.append)
     assert said[-2].startswith("asked 0.30")
     assert "apt-get" in said[-1]
 
@@ -243,24 +245,24 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
 
 @pytest.mark.parametrize(
     "command",
-    [["run", "walk", "--speed", "0.2"], ["video"], ["export", "--to", "w.csv", "--speed", "0.2"]],
+    [["play", "--speed", "0.2"], ["export", "--to", "w.csv", "--speed", "0.2"]],
     ids=lambda command: command[0],
 )
 def test_a_policy_of_another_robot_is_refused(bench, capsys, command):
     settings = walk.SETTINGS["quick"]
     walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
-    assert main([*command, "--policy", "p.npz", "--robot", "nao_h25"]) == 2
+    assert tools([*command, "--policy", "p.npz", "--robot", "nao_h25"]) == 2
     assert capsys.readouterr().err == "error: p.npz is a policy of the robot nao, not of nao_h25\n"
     assert not Path("w.csv").exists() and not bench
 
 
 def test_each_robot_has_its_latest_run(bench):
-    shipped = walking_policy.default_policy("nao_h25")
-    assert shipped == shipped_policy("nao_h25") != walking_policy.default_policy()
+    shipped = play.default_policy("nao_h25")
+    assert shipped == shipped_policy("nao_h25") != play.default_policy()
     request = runner.Request("walk", overrides={"robot": "nao_h25"})
     folder = runner.run(request, console=None, say=lambda _: None)
-    assert walking_policy.default_policy("nao_h25") == folder / "policy.npz"
-    assert walking_policy.default_policy() == walking_policy.default_policy("nao") == SHIPPED
+    assert play.default_policy("nao_h25") == folder / "policy.npz"
+    assert play.default_policy() == play.default_policy("nao") == SHIPPED
     kept = results.load_manifest(folder)["settings"]
     assert (kept["robot"], kept["low"], kept["high"], kept["bounds"]) == ("nao_h25", 0.05, 0.3, "nao_h25")
     assert kept["physics"] == ("c" if jax.default_backend() == "cpu" else "mjx")
@@ -273,10 +275,10 @@ def test_each_robot_has_its_latest_run(bench):
 
 def test_films_show_six_speeds_of_the_policys_range():
     nao, h25 = (load_walking_policy(shipped_policy(robot)) for robot in WALKERS)
-    assert walking_policy.filmed_speeds(nao) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    assert play.filmed_speeds(nao) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     walker = WALKERS["nao_h25"]
-    assert walking_policy.filmed_speeds(h25)[0] == walker.low
-    assert walking_policy.filmed_speeds(h25)[-1] == walker.high
+    assert play.filmed_speeds(h25)[0] == walker.low
+    assert play.filmed_speeds(h25)[-1] == walker.high
 
 
 @pytest.mark.parametrize(
@@ -320,7 +322,7 @@ def unfinished(name, settings):
     folder = Path("results/walk") / name
     manifest = results.make_manifest("walk", "quick", walk.SETTINGS["quick"], 0)
     manifest |= {"settings": settings, "status": "interrupted", "started": name}
-    results.save_json(folder / results.MANIFEST, manifest)
+    files.save_json(folder / results.MANIFEST, manifest)
     return folder
 
 

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from creps_jax.errors import UserError
 from creps_jax.simulation import c
 from creps_jax.simulation.state import initial_state
 from creps_jax.tasks.walking import load_nao
 from experiments import walk_inside
-from experiments.errors import UserError
 from experiments.probe import Measured, Probe
 
 

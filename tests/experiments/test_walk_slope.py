@@ -7,13 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from creps_jax.errors import UserError
+from creps_jax.files import policies_folder
+from creps_jax.policies.learned import load_policy
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.walking import WalkOutcome, WalkRecord
+from creps_jax.tools import play
+from creps_jax.tools.video import Clip
 from creps_jax.walking.params import PARAM_NAMES
-from experiments import results, runner, walk, walk_slope, walking_policy
-from experiments.errors import UserError
-from experiments.policy_file import load_policy, policies_folder
-from experiments.video import Clip
+from experiments import runner, walk, walk_slope
 
 STEEPEST = 9.0
 
@@ -54,7 +56,7 @@ def test_the_result_folder_is_complete(settings):
     files = "arrays.npz manifest.json checkpoint-walk_slope.npz claims.md policy.npz table.md"
     figures = "learning_curve.png updates.png falls.png speed.png parameters.png"
     assert {path.name for path in folder.iterdir()} == {*files.split(), *figures.split()}
-    arrays = results.load_arrays(folder / "arrays.npz")
+    arrays = files.load_arrays(folder / "arrays.npz")
     speeds, slopes = arrays["speeds"], arrays["slopes"]
     np.testing.assert_allclose(speeds, [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4], rtol=1e-6)
     np.testing.assert_allclose(slopes, [-10, -7.5, -5, -2.5, 0, 2.5, 5, 7.5, 10])
@@ -109,14 +111,14 @@ def test_films_show_each_walk_on_its_slope(settings, monkeypatch):
         return WalkRecord(time, qpos, qpos, qpos, jnp.zeros(len(time), bool))
 
     policy = walk.saved_policy(settings, walk.first_policy(settings))
-    monkeypatch.setattr(walking_policy, "record_walk", recorded)
-    clips = walking_policy.record(policy, (0.2, 0.3), seed=0, slopes=(2.0, -4.0))
+    monkeypatch.setattr(play, "record_walk", recorded)
+    clips = play.record(policy, (0.2, 0.3), seed=0, slopes=(2.0, -4.0))
     assert [clip.slope for clip in clips] == [2.0, -4.0]
     captions = [clip.caption for clip in clips]
     assert captions[0] == "slope 2°, asked 0.20 m/s, reached 0.20 m/s"
     assert captions[1] == "slope -4°, asked 0.30 m/s, reached -0.40 m/s"
     with pytest.raises(UserError, match="slope must be within the learned range, -10 to 10 deg, got 12"):
-        walking_policy.record(policy, (0.2,), seed=0, slopes=(12.0,))
+        play.record(policy, (0.2,), seed=0, slopes=(12.0,))
 
 
 def test_settings_come_back_from_a_manifest(settings):

@@ -15,7 +15,8 @@ from creps_jax.policies.features import linear_features, quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.search.creps import creps
 from creps_jax.tasks.sine import sinus
-from experiments import learning, plots, registry
+from creps_jax.tools import plots
+from experiments import learning, registry
 from experiments.learning import Plan, learn, trial_keys
 from experiments.registry import Claim
 

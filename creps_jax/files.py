@@ -1,0 +1,165 @@
+"""Read and write files: arrays, texts and JSON, always whole."""
+
+import contextlib
+import errno
+import json
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from creps_jax.errors import UserError
+
+
+def models_folder() -> Path:
+    """Return the folder of the robots' models and policies, in the checkout or in the installed package."""
+    package = Path(__file__).resolve().parent
+    checkout = package.parent / "models"
+    return checkout if checkout.is_dir() else package / "models"
+
+
+def policies_folder(robot: str = "nao") -> Path:
+    """Return the folder of the policies of a robot that come with the package."""
+    return models_folder() / robot / "policies"
+
+
+def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Write a file so that a reader finds either the old one or the new one, whole.
+
+    The bytes go to a temporary name in the same folder, to the disk, and only then to the name.
+
+    Args:
+        path: where the file shall be; its folder is made if need be.
+        write: gets the open file and writes to it.
+
+    Raises:
+        UserError: if the file cannot be written, a full disk for example; an earlier file stays.
+    """
+    temporary: Path | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+        temporary = Path(name)
+        with open(handle, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        # mkstemp makes files private; results are as readable as any other file.
+        temporary.chmod(0o666 & ~umask())
+        os.replace(temporary, path)
+        temporary = None
+    except OSError as error:
+        reason = error.strerror or error
+        raise UserError(
+            f"cannot write {path}: {reason}; files that were there before are unharmed"
+        ) from error
+    finally:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """See that the names in a folder, and not only what their files hold, last a loss of power.
+
+    Raises:
+        UserError: if the disk refuses.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        # Some network file systems know no such thing; there is nothing more to be done on them.
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            reason = error.strerror or error
+            raise UserError(f"what was written to {folder} may not last a loss of power: {reason}") from error
+
+
+def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
+    """Write named arrays to a compressed .npz file, atomically."""
+    as_numpy = {name: np.asarray(value) for name, value in arrays.items()}
+    write_atomically(path, lambda file: np.savez_compressed(file, allow_pickle=False, **as_numpy))
+
+
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Read every array of an .npz file.
+
+    Raises:
+        UserError: if there is no such file, it is cut short, or it is no .npz file of plain arrays.
+    """
+    if not path.exists():
+        raise UserError(f"no such file: {path}")
+    if path.is_dir():
+        raise UserError(f"{path} is a folder, expected an .npz file")
+    try:
+        # Opened here: a file that np.load refuses it would leave open.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return dict(arrays)
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or 'it is no whole .npz file'}") from error
+    except (ValueError, TypeError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        raise UserError(f"cannot read {path}: it is cut short, or no .npz file of plain arrays") from error
+
+
+def save_text(path: Path, text: str) -> None:
+    """Write a text file, atomically."""
+    write_atomically(path, lambda file: file.write(text.encode()))
+
+
+def save_json(path: Path, values: Any) -> None:
+    """Write values as indented JSON, atomically."""
+    save_text(path, json.dumps(values, indent=2, default=str) + "\n")
+
+
+def load_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        UserError: if there is none, it is cut short, it is no JSON, or it names a field twice.
+    """
+    try:
+        return json.loads(path.read_text("utf-8"), object_pairs_hook=_without_repetition)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
+    except OSError as error:
+        raise UserError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:
+        raise UserError(f"cannot read {path}: it is cut short, or no JSON file ({error})") from error
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    names = [name for name, _ in pairs]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"the field {name!r} is there twice")
+    return dict(pairs)
+
+
+def check_writable(folder: Path) -> None:
+    """See that a folder can be made and written to, before work is done whose result goes there.
+
+    Raises:
+        UserError: if it cannot.
+    """
+    try:
+        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise UserError(f"cannot write to the folder {folder}: {error.strerror or error}") from error
+
+
+def umask() -> int:
+    """Return which permissions new files of this process do not get."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask

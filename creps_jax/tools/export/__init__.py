@@ -1,0 +1,95 @@
+"""Take a policy away: write it, or a walk that it makes, for use without this project."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from creps_jax.errors import UserError
+from creps_jax.tools.process import import_mjx_quietly
+
+if TYPE_CHECKING:
+    from creps_jax.policies.learned import SavedPolicy
+
+_OF_POLICY = {".onnx": "ONNX model", ".h": "C header"}
+_OF_WALK = {".csv": "CSV table", ".npz": "NumPy arrays"}
+_DURATION = 8.0
+
+
+def export(
+    to: Path,
+    policy: Path | None,
+    *,
+    robot: str | None = None,
+    speed: float | None,
+    duration: float | None,
+    say: Callable[[str], None],
+) -> None:
+    """Write a policy as .onnx or .h (C), or the joint set-points of one of its walks as .csv or .npz.
+
+    Args:
+        to: the file; its ending says what it shall be. One that is there is overwritten.
+        policy: policy file; None is the latest learned walking policy of the robot, or else the shipped one.
+        robot: whose walking policy it is; None is the policy's robot, or without a policy the NAO.
+        speed: speed of the walk, m/s; only for a walk, which needs it.
+        duration: length of the walk, s; only for a walk, 8 by default.
+        say: told one line at a time.
+
+    Raises:
+        UserError: for a mistake in the request, an unreadable policy, or a file that cannot be written.
+    """
+    ending = to.suffix.lower()
+    _check_request(to, ending, speed, duration)
+    # Everything else is imported late: it takes seconds, and mistakes are answered at once.
+    path = policy or _default_policy(robot)
+    if _are_the_same(to, path):
+        raise UserError(f"--to {to} is the policy file itself, name another file")
+    if speed is not None:
+        import_mjx_quietly()
+        from creps_jax.tools.export import trajectory
+
+        walk = trajectory.plan(path, speed, _DURATION if duration is None else duration, robot=robot)
+        {".csv": trajectory.save_csv, ".npz": trajectory.save_npz}[ending](to, walk)
+    else:
+        from creps_jax.policies.learned import load_policy
+        from creps_jax.tools.export import c_header, onnx_model
+
+        saved = load_policy(path) if robot is None else _load_walking_policy(path, robot)
+        {".onnx": onnx_model.save, ".h": c_header.save}[ending](to, saved)
+    say(f"policy: {path}")
+    say(f"{(_OF_POLICY | _OF_WALK)[ending]}: {to}")
+
+
+def _check_request(to: Path, ending: str, speed: float | None, duration: float | None) -> None:
+    """Refuse an unknown ending, and options that do not go with it."""
+    if ending in _OF_WALK:
+        if speed is None:
+            raise UserError(f"{to} would hold the joint set-points of a walk, which need --speed, in m/s")
+    elif ending in _OF_POLICY:
+        for name, value in (("speed", speed), ("duration", duration)):
+            if value is not None:
+                raise UserError(
+                    f"--{name} goes with {' and '.join(_OF_WALK)}: {to} is the policy, for every context"
+                )
+    else:
+        raise UserError(f"--to must end in {', '.join(_OF_POLICY | _OF_WALK)}, got {to}")
+
+
+def _are_the_same(path: Path, other: Path) -> bool:
+    try:
+        return path.samefile(other)
+    except OSError:
+        return False
+
+
+def _default_policy(robot: str | None) -> Path:
+    import_mjx_quietly()
+    from creps_jax.tools.play import default_policy
+
+    return default_policy(robot)
+
+
+def _load_walking_policy(path: Path, robot: str) -> "SavedPolicy":
+    import_mjx_quietly()
+    from creps_jax.tools.play import load_walking_policy
+
+    return load_walking_policy(path, robot)

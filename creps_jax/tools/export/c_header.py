@@ -1,0 +1,127 @@
+"""Write a policy as a C header that needs nothing but expf, for microcontrollers and robots."""
+
+import re
+import string
+import textwrap
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from creps_jax.files import save_text
+from creps_jax.policies.learned import SavedPolicy
+from creps_jax.tools.export.c_code import HEADER, HOLD_BOUNDS, LINEAR, RBF
+from creps_jax.tools.export.formula import Formula, formula_of
+from creps_jax.tools.results import project_version
+
+# Characters that stand for themselves in a C string: no quotes, backslashes, nor "?", of which two begin
+# a trigraph.
+_PLAIN = string.ascii_letters + string.digits + " _.,:;/^*+-=%()[]"
+
+
+def save(path: Path, policy: SavedPolicy) -> None:
+    """Write a policy as a C header, atomically."""
+    save_text(path, make_header(policy))
+
+
+def make_header(policy: SavedPolicy) -> str:
+    """Return a header of C99, and C++, with names, units, bounds, range and function of a policy.
+
+    What it declares begins with the name of the task; characters that C has not become underscores.
+
+    Raises:
+        UserError: if a number of the policy is too large for single precision.
+    """
+    formula = formula_of(policy)
+    prefix = _prefix(policy)
+    names = {"prefix": prefix, "PREFIX": prefix.upper()}
+    features = RBF if len(formula.centers) else LINEAR
+    is_bounded = policy.constraint != "none"
+    held = f", within {prefix}_parameter_low to {prefix}_parameter_high" if is_bounded else ""
+    middle = 0.5 * (formula.context_low + formula.context_high)
+    return HEADER.substitute(
+        names,
+        version=project_version(),
+        example=", ".join(f"{value:g}" for value in middle),
+        first=_enumerators(f"{prefix}_PARAMETER", policy.param_names)[0],
+        num_contexts=len(policy.context_names),
+        num_params=len(policy.param_names),
+        num_features=len(formula.coef),
+        tables=_tables(policy, formula, prefix),
+        held=held,
+        compute_features=string.Template(features).substitute(names),
+        hold_bounds=string.Template(HOLD_BOUNDS[policy.constraint]).substitute(names),
+    )
+
+
+def _tables(policy: SavedPolicy, formula: Formula, prefix: str) -> str:
+    """Declare the indices, names, units and numbers of a policy."""
+    contexts, params, features = (
+        f"{prefix.upper()}_NUM_{what}" for what in ("CONTEXTS", "PARAMETERS", "FEATURES")
+    )
+    tables = [
+        _enum(f"{prefix}_context", policy.context_names),
+        _enum(f"{prefix}_parameter", policy.param_names),
+        _strings(f"{prefix}_context_names[{contexts}]", policy.context_names),
+        _strings(f"{prefix}_context_units[{contexts}]", policy.context_units),
+        _floats(f"{prefix}_context_low[{contexts}]", formula.context_low),
+        _floats(f"{prefix}_context_high[{contexts}]", formula.context_high),
+        _strings(f"{prefix}_parameter_names[{params}]", policy.param_names),
+        _strings(f"{prefix}_parameter_units[{params}]", policy.param_units),
+        _floats(f"{prefix}_parameter_low[{params}]", formula.param_low),
+        _floats(f"{prefix}_parameter_high[{params}]", formula.param_high),
+        _floats(f"{prefix}_coef[{features}][{params}]", formula.coef),
+    ]
+    if len(formula.centers):
+        tables.append(_floats(f"{prefix}_centers[{features}][{contexts}]", formula.centers))
+        tables.append(_floats(f"{prefix}_widths[{contexts}]", formula.widths))
+    return "\n".join(tables)
+
+
+def _prefix(policy: SavedPolicy) -> str:
+    """Return the task's name as the beginning of C identifiers."""
+    name = _identifier(str(policy.task.get("name", ""))).lower()
+    return f"task_{name}" if name[:1].isdigit() else name or "learned"
+
+
+def _identifier(name: str) -> str:
+    return re.sub("[^0-9A-Za-z]+", "_", name).strip("_")
+
+
+def _enumerators(tag: str, names: Sequence[str]) -> list[str]:
+    """Make C identifiers of names; if two become the same one, all get their index."""
+    stems = [f"{tag}_{_identifier(name)}".upper() for name in names]
+    return stems if len(set(stems)) == len(stems) else [f"{stem}_{i}" for i, stem in enumerate(stems)]
+
+
+def _enum(tag: str, names: Sequence[str]) -> str:
+    return f"enum {tag} {{{_lines(_enumerators(tag, names))}}};\n"
+
+
+def _strings(declarator: str, values: Iterable[str]) -> str:
+    return f"static const char *const {declarator} = {{{_lines(map(_string, values))}}};\n"
+
+
+def _floats(declarator: str, values: np.ndarray) -> str:
+    """Declare a vector, or a matrix with a brace for each row."""
+    rows = [", ".join(map(_number, row)) for row in np.atleast_2d(values)]
+    rows = [f"{{{row}}}" for row in rows] if values.ndim == 2 else rows
+    indent = " " * (values.ndim - 1)
+    wrapped = [textwrap.fill(row, 96, subsequent_indent=indent, break_on_hyphens=False) for row in rows]
+    return f"static const float {declarator} = {{{_lines(wrapped)}}};\n"
+
+
+def _lines(items: Iterable[str]) -> str:
+    """List items, each on a line of its own."""
+    return "\n" + textwrap.indent(",\n".join(items), "    ") + "\n"
+
+
+def _string(text: str) -> str:
+    """Write a C string literal: all but plain characters as the octal numbers of their UTF-8 bytes."""
+    return '"' + "".join(chr(b) if chr(b) in _PLAIN else f"\\{b:03o}" for b in text.encode()) + '"'
+
+
+def _number(value: np.floating) -> str:
+    """Write a float literal that reads back as the same number."""
+    digits = f"{value:.9g}"
+    return f"{digits}f" if set(digits) & set(".e") else f"{digits}.0f"

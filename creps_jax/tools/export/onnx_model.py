@@ -1,0 +1,155 @@
+"""Write a policy as an ONNX model, which many runtimes and languages read."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from creps_jax.files import write_atomically
+from creps_jax.policies.learned import SavedPolicy
+from creps_jax.tools.export.formula import Formula, formula_of
+from creps_jax.tools.results import project_version
+
+# As old as the operators allow (a ReduceSum whose axes are an input is of opset 13), so that old runtimes
+# read it too.
+OPSET = 13
+IR_VERSION = 7
+
+
+def save(path: Path, policy: SavedPolicy) -> None:
+    """Write a policy as an ONNX model, atomically."""
+    model = make_model(policy)
+    write_atomically(path, lambda file: file.write(model.SerializeToString()))
+
+
+def make_model(policy: SavedPolicy) -> onnx.ModelProto:
+    """Build the model: `context` (batch, s) to `parameters` (batch, d) and `in_range` (batch,).
+
+    Context variables outside the learned range count as at its nearest end, NaN as at the lower one;
+    `in_range` is true where there are none. The metadata has names, units, bounds and range, as JSON.
+
+    Raises:
+        UserError: if a number of the policy is too large for single precision.
+    """
+    nodes = [*_clamp(), *_mean(policy.features.kind), *_hold_bounds(policy.constraint)]
+    used = {name for node in nodes for name in node.input}
+    constants = _constants(formula_of(policy))
+    tensors = [numpy_helper.from_array(values, name) for name, values in constants.items() if name in used]
+    contexts, params = ", ".join(policy.context_names), ", ".join(policy.param_names)
+    value = helper.make_tensor_value_info
+    context = value("context", TensorProto.FLOAT, ["batch", len(policy.context_names)], contexts)
+    parameters = value("parameters", TensorProto.FLOAT, ["batch", len(policy.param_names)], params)
+    in_range = value(
+        "in_range", TensorProto.BOOL, ["batch"], "whether the context is within the learned range"
+    )
+    graph = helper.make_graph(nodes, "policy", [context], [parameters, in_range], tensors)
+    model = helper.make_model(
+        graph,
+        producer_name="creps_jax",
+        producer_version=project_version(),
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        doc_string=_description(policy),
+    )
+    helper.set_model_props(model, {name: json.dumps(value) for name, value in _metadata(policy).items()})
+    return model
+
+
+def _clamp() -> list[onnx.NodeProto]:
+    """Compute `nearest` and `in_range` from `context`; comparisons with NaN are false."""
+    return [
+        _node("not_below", "GreaterOrEqual", "context", "context_low"),
+        _node("raised", "Where", "not_below", "context", "context_low"),
+        _node("not_above", "LessOrEqual", "raised", "context_high"),
+        _node("nearest", "Where", "not_above", "raised", "context_high"),
+        _node("is_inside", "And", "not_below", "not_above"),
+        # There is no "all" of booleans.
+        _node("inside", "Cast", "is_inside", to=TensorProto.FLOAT),
+        _node("all_inside", "ReduceMin", "inside", axes=[1], keepdims=0),
+        _node("in_range", "Cast", "all_inside", to=TensorProto.BOOL),
+    ]
+
+
+def _mean(kind: str) -> list[onnx.NodeProto]:
+    """Compute `mean`, the parameters before any bounds are applied, from `nearest`."""
+    if kind == "linear":
+        return [
+            _node("rise", "MatMul", "nearest", "slope"),
+            _node("mean", "Add", "rise", "intercept"),
+        ]
+    return [
+        _node("row", "Unsqueeze", "nearest", "middle_axis"),
+        _node("offset", "Sub", "row", "centers"),
+        _node("distance", "Div", "offset", "widths"),
+        _node("squares", "Mul", "distance", "distance"),
+        _node("square", "ReduceSum", "squares", "last_axis", keepdims=0),
+        _node("log_weights", "Mul", "square", "minus_half"),
+        _node("features", "Softmax", "log_weights", axis=1),
+        _node("mean", "MatMul", "features", "coef"),
+    ]
+
+
+def _hold_bounds(constraint: str) -> list[onnx.NodeProto]:
+    """Compute `parameters` from `mean`."""
+    if constraint == "none":
+        return [_node("parameters", "Identity", "mean")]
+    squash = [
+        _node("share", "Sigmoid", "mean"),
+        _node("above_low", "Mul", "share", "param_range"),
+        _node("squashed", "Add", "above_low", "param_low"),
+    ]
+    is_squashed = constraint == "sigmoid"
+    return [
+        *(squash if is_squashed else []),
+        # After a sigmoid this takes back the last bit that rounding can put outside the box.
+        _node("not_too_low", "Max", "squashed" if is_squashed else "mean", "param_low"),
+        _node("parameters", "Min", "not_too_low", "param_high"),
+    ]
+
+
+def _constants(formula: Formula) -> dict[str, np.ndarray]:
+    """Name all constants that a node may use."""
+    return formula._asdict() | {
+        "intercept": formula.coef[0],
+        "slope": formula.coef[1:],
+        "minus_half": np.array(-0.5, np.float32),
+        "middle_axis": np.array([1]),
+        "last_axis": np.array([2]),
+        "param_range": formula.param_high - formula.param_low,
+    }
+
+
+def _node(output: str, operator: str, *inputs: str, **attributes: Any) -> onnx.NodeProto:
+    return helper.make_node(operator, inputs, [output], **attributes)
+
+
+def _metadata(policy: SavedPolicy) -> dict[str, Any]:
+    """List what a user of the model has to know."""
+    return {
+        "task": dict(policy.task),
+        "context_names": policy.context_names,
+        "context_units": policy.context_units,
+        "context_low": policy.context_low,
+        "context_high": policy.context_high,
+        "parameter_names": policy.param_names,
+        "parameter_units": policy.param_units,
+        "parameter_low": policy.param_low,
+        "parameter_high": policy.param_high,
+        "constraint": policy.constraint,
+    }
+
+
+def _description(policy: SavedPolicy) -> str:
+    """Say in words what the model computes."""
+    ranges = zip(
+        policy.context_names, policy.context_low, policy.context_high, policy.context_units, strict=True
+    )
+    learned = ", ".join(f"{name} {low:g} to {high:g} {unit}".rstrip() for name, low, high, unit in ranges)
+    return (
+        f"Parameters of the task {policy.task.get('name', 'unknown')} for a context, by a policy that was "
+        f"learned with creps_jax. Learned range: {learned}. A context outside of it counts as at its nearest "
+        "end, and in_range is false."
+    )

@@ -1,0 +1,209 @@
+"""Use a walking policy: record its walks, show one of them, film several side by side."""
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from creps_jax import files
+from creps_jax.errors import UserError
+from creps_jax.files import policies_folder
+from creps_jax.policies.learned import SavedPolicy, load_policy
+from creps_jax.robots.robot import NAO, Robot
+from creps_jax.simulation import c
+from creps_jax.tasks.conditions import slope
+from creps_jax.tasks.walking import CONTROL_PERIOD, model_path, record_walk
+from creps_jax.tools import results
+from creps_jax.tools.robots import find_walker
+from creps_jax.tools.video import Clip, VideoError, write_video
+from creps_jax.walking.params import PARAM_NAMES
+from creps_jax.walking.posture import Balance
+
+POLICY = "policy.npz"
+START_UP = 2.0
+_MOST_WALKS = 24
+_FILMED = 6
+
+
+def show(
+    speeds: Sequence[float],
+    path: Path | None,
+    *,
+    robot: str | None = None,
+    out: Path,
+    seed: int,
+    say: Callable[[str], None],
+) -> None:
+    """Show walks at several speeds: what they reach, of a single one its parameters, and a video.
+
+    Args:
+        speeds: asked speeds, m/s; of none, six over the policy's range.
+        path: policy file; None is the latest learned one of the robot, or else the shipped one.
+        robot: who walks; None is the policy's robot, or without a policy the NAO.
+        out: the video, an .mp4 file.
+        seed: seed of the noise.
+        say: told one line at a time.
+
+    Raises:
+        UserError: if there is no such policy, it is unreadable or of another robot, a speed is outside its
+            range or there are too many, or the video cannot be written.
+    """
+    if out.suffix != ".mp4" or out.is_dir():
+        raise UserError(f"a video must be an .mp4 file, got {out}")
+    if len(speeds) > _MOST_WALKS:
+        raise UserError(f"a video must show at most {_MOST_WALKS} walks, got {len(speeds)} speeds")
+    files.check_writable(out.parent)
+    path = path or default_policy(robot)
+    policy = load_walking_policy(path, robot)
+    speeds = speeds or filmed_speeds(policy)
+    thetas = [policy.theta(speed) for speed in speeds]
+    say(f"policy: {path}")
+    if len(thetas) == 1:
+        for name, unit, value in zip(policy.param_names, policy.param_units, thetas[0], strict=True):
+            say(f"  {name.replace('_', ' '):16}{value:8.4f} {unit}".rstrip())
+    clips = record(policy, speeds, seed=seed)
+    for clip in clips:
+        say(clip.caption)
+    save_film(clips, out, say, robot=robot_of(policy))
+
+
+def filmed_speeds(policy: SavedPolicy) -> list[float]:
+    """Return six speeds over the range of a policy, m/s."""
+    speeds = np.linspace(policy.context_low[0], policy.context_high[0], _FILMED)
+    return [round(float(speed), 6) for speed in speeds]
+
+
+def record(
+    policy: SavedPolicy,
+    speeds: Sequence[float],
+    *,
+    seed: int,
+    duration: float = 8.0,
+    slopes: Sequence[float] | None = None,
+) -> list[Clip]:
+    """Record a walk at each speed, captioned with asked and reached speed.
+
+    Args:
+        policy: a policy of the speed, or of speed and slope.
+        speeds: asked speeds, m/s.
+        seed: seed of the noise.
+        duration: length of the walks, s.
+        slopes: slope of each walk, deg, for a policy that takes it.
+
+    Raises:
+        UserError: if there is no speed, or a context is not one that the policy has learned.
+    """
+    if not speeds:
+        raise UserError("name at least one speed")
+    ways = np.zeros((len(speeds), 0)) if slopes is None else np.array(slopes, float)[:, None]
+    thetas = jnp.stack(
+        [jnp.asarray(policy.theta(speed, *way)) for speed, way in zip(speeds, ways, strict=True)]
+    )
+    # For a few walks, compiling MJX would take longer than they do.
+    settings = {"duration": duration, "balance": balance_of(policy), "physics": c.make_control_step}
+    settings["robot"] = robot_of(policy)
+    if slopes is not None:
+        settings["conditions"] = (slope(policy.context_low[1], policy.context_high[1]),)
+    walk = jax.jit(jax.vmap(lambda key, theta, way: record_walk(key, theta, values=way, **settings)))
+    keys = jax.random.split(jax.random.key(seed), len(speeds))
+    walks = walk(keys, thetas, jnp.asarray(ways, jnp.float32))
+    qpos, fallen = np.asarray(walks.qpos), np.asarray(walks.has_fallen)
+    clips = []
+    for index, speed in enumerate(speeds):
+        start = round(START_UP / CONTROL_PERIOD) - 1
+        reached = (qpos[index, -1, 0] - qpos[index, start, 0]) / (duration - START_UP)
+        verdict = "fell" if fallen[index, -1] else f"reached {reached:.2f} m/s"
+        rise = 0.0 if slopes is None else slopes[index]
+        where = "" if slopes is None else f"slope {rise:g}°, "
+        clips.append(Clip(f"{where}asked {speed:.2f} m/s, {verdict}", qpos[index], CONTROL_PERIOD, rise))
+    return clips
+
+
+def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None], *, robot: Robot) -> None:
+    """Write a video, or say why there is none: it is the one part of a result that a machine may lack."""
+    try:
+        middle = len(clips[0].qpos) * clips[0].period / 2
+        write_video(path, model_path(robot), clips, still_at=middle)
+        say(f"video: {path}")
+    except VideoError as error:
+        say(str(error))
+
+
+def default_policy(robot: str | None = None) -> Path:
+    """Return the policy of a robot's latest finished run, or else the one that comes with the project.
+
+    Args:
+        robot: the robot's name; None is the NAO.
+
+    Raises:
+        UserError: if there is neither, or no such robot.
+    """
+    robot = find_walker(robot or NAO.name).robot.name
+    folder = results.latest_folder("walk", status="finished", robot=robot)
+    if folder is not None and (folder / POLICY).exists():
+        return folder / POLICY
+    return shipped_policy(robot)
+
+
+def shipped_policy(robot: str | None = None) -> Path:
+    """Return the policy of a robot, by default the NAO, that comes with the project.
+
+    Raises:
+        UserError: if there is none, or no such robot.
+    """
+    robot = find_walker(robot or NAO.name).robot.name
+    shipped = sorted(policies_folder(robot).glob("*.npz"))
+    if not shipped:
+        asked = "" if robot == NAO.name else f" --robot {robot}"
+        raise UserError(
+            f"no policy has been learned yet: python -m experiments run walk{asked} --preset quick"
+        )
+    return shipped[-1]
+
+
+def load_walking_policy(path: Path, robot: str | None = None) -> SavedPolicy:
+    """Read a policy file and see that it is one of walking.
+
+    Args:
+        path: the file.
+        robot: whose policy it has to be; None is anyone's.
+
+    Raises:
+        UserError: if it is not, or is unreadable, or of an unknown robot.
+    """
+    policy = load_policy(path)
+    if policy.param_names != PARAM_NAMES:
+        raise UserError(f"{path} is no walking policy: its parameters are {', '.join(policy.param_names)}")
+    try:
+        is_finite = all(math.isfinite(gain) for gain in balance_of(policy))  # type: ignore[arg-type]
+    except (KeyError, TypeError):
+        is_finite = False
+    if not is_finite:
+        wanted = ", ".join(Balance._fields)
+        raise UserError(
+            f"{path} does not say how its steps were balanced: expected {wanted}, got {policy.task}"
+        )
+    try:
+        found = robot_of(policy).name
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    if robot is not None and find_walker(robot).robot.name != found:
+        raise UserError(f"{path} is a policy of the robot {found}, not of {robot}")
+    return policy
+
+
+def robot_of(policy: SavedPolicy) -> Robot:
+    """Return the robot that a policy was learned with: the NAO where the file, an older one, does not say.
+
+    Raises:
+        UserError: if it is unknown.
+    """
+    return find_walker(str(policy.task.get("robot", NAO.name))).robot
+
+
+def balance_of(policy: SavedPolicy) -> Balance:
+    """Return how the steps of a policy answered to the measured orientation while it was learned."""
+    return Balance(**policy.task["balance"])

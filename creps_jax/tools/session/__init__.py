@@ -1,0 +1,9 @@
+"""Learn on a real robot, trial by trial: a search that is kept in a folder, whole at any moment.
+
+Nothing heavy is imported before it is needed: to tell a reward takes no jax.
+"""
+
+from creps_jax.tools.session.robot_session import RobotSession, Status, Told
+from creps_jax.tools.session.trials import Trial
+
+__all__ = ["RobotSession", "Status", "Told", "Trial"]

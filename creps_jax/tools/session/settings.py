@@ -1,0 +1,229 @@
+"""Say what a session is about: the contexts, the parameters and how to learn; written as plain JSON."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from creps_jax import files
+from creps_jax.errors import UserError
+from creps_jax.tools.session import plain
+
+CONSTRAINTS = ("sigmoid", "clip")
+MAX_BATCH = 10_000
+"""So many trials are drawn, and written down, at once."""
+MAX_ARCHIVE = 1_000_000
+"""So many trials an update can hold in memory."""
+MAX_CONTEXTS = 10
+"""Policies are compared on a grid of contexts, which has 2^10 points then."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Context:
+    """A variable that the robot is given, such as a distance, and its range."""
+
+    name: str
+    unit: str = ""
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        _check_range(self)
+
+    @property
+    def label(self) -> str:
+        """The name with its unit."""
+        return f"{self.name} ({self.unit})" if self.unit else self.name
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Parameter(Context):
+    """A number that the robot is run with, and its bounds.
+
+    Attributes:
+        start: mean of the first policy, in the parameter's unit; by default the middle of the bounds.
+        spread: its standard deviation; by default an eighth of the way between the bounds.
+    """
+
+    start: float | None = None
+    spread: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.start is not None and not self.low <= self.start <= self.high:
+            raise UserError(
+                f"start of {self.name} must be within its bounds, {self.low:g} to {self.high:g} {self.unit}, "
+                f"got {self.start:g}"
+            )
+        if self.spread is not None and not self.spread > 0:
+            raise UserError(f"spread of {self.name} must be above zero, got {self.spread:g}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FeatureSettings:
+    """The features of the policy: the fields of `creps_jax.policies.learned.Features`.
+
+    By default there are 5 centres for one context variable, for two 3 along each, and 2 for more: a session
+    has few trials, and 25 centres learn nothing from fifty of them.
+    """
+
+    kind: str = "rbf"
+    num_centers: int | None = None
+    bandwidth: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FirstPolicy:
+    """The policy to begin with: the arrays of a `LinearGaussian`, by rows."""
+
+    coef: tuple[tuple[float, ...], ...]
+    cov_chol: tuple[tuple[float, ...], ...]
+
+    def __post_init__(self) -> None:
+        for name, rows in (("coef", self.coef), ("cov_chol", self.cov_chol)):
+            if len(set(map(len, rows))) != 1:
+                raise UserError(f"{name} must have rows of one length, got {list(map(len, rows))}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """All that decides what a session learns, but for the trials.
+
+    Attributes:
+        contexts: what the policy is told.
+        parameters: what the policy decides.
+        features: of the context; the policy's mean is linear in them.
+        constraint: how parameters are kept in their bounds: "sigmoid" searches numbers that are squashed into
+            them, "clip" cuts off what is drawn outside, and learns from what is left.
+        kl_bound: epsilon, how far the weights of samples may move from even ones, nats.
+        mean_kl_bound: how far an update may move the policy's mean, nats, see `bounded_ml`; with
+            `cov_kl_bound` None it is not bounded, as in the paper.
+        cov_kl_bound: how far it may move the covariance, nats.
+        batch_size: trials that make an update.
+        archive_size: last trials that are learned from; five batches by default, or more if that is too few.
+        seed: of the contexts and of the exploration.
+        first_policy: what to begin with, in place of start and spread of the parameters.
+        task: what a saved policy says of its task; nothing here depends on it.
+    """
+
+    contexts: tuple[Context, ...]
+    parameters: tuple[Parameter, ...]
+    features: FeatureSettings = FeatureSettings()
+    constraint: str = "sigmoid"
+    kl_bound: float = 0.5
+    mean_kl_bound: float | None = 0.5
+    cov_kl_bound: float | None = 0.05
+    batch_size: int = 10
+    archive_size: int | None = None
+    seed: int = 0
+    first_policy: FirstPolicy | None = None
+    # Two settings that differ in it alone are not equal, but may share a hash.
+    task: dict[str, Any] = dataclasses.field(default_factory=dict, hash=False)
+
+    def __post_init__(self) -> None:
+        _check_variables(self.contexts, self.parameters)
+        _check_numbers(self)
+        for parameter in self.parameters:
+            start = parameter.start
+            if (
+                start is not None
+                and self.constraint == "sigmoid"
+                and start in (parameter.low, parameter.high)
+            ):
+                raise UserError(
+                    f"start of {parameter.name} is at its bound, {start:g}, which a sigmoid never reaches"
+                )
+            if self.first_policy is not None and (start, parameter.spread) != (None, None):
+                raise UserError(f"start and spread of {parameter.name} do not go with first_policy")
+
+    @property
+    def context_names(self) -> tuple[str, ...]:
+        """The names of the context variables."""
+        return tuple(context.name for context in self.contexts)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def checked_context(self, context: Sequence[float]) -> list[float]:
+        """Return a context.
+
+        Raises:
+            UserError: if it has not a number for each variable, within its range.
+        """
+        if len(context) != len(self.contexts):
+            names = ", ".join(self.context_names)
+            raise UserError(f"expected a number for each of {names}, got {tuple(context)}")
+        for value, each in zip(context, self.contexts, strict=True):
+            if not each.low <= value <= each.high:
+                raise UserError(
+                    f"{each.name} must be within {each.low:g} to {each.high:g} {each.unit}, got {value}"
+                )
+        return [float(value) for value in context]
+
+    def digest(self) -> str:
+        """Return a short text that other settings do not have."""
+        text = json.dumps(dataclasses.asdict(self), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def load_settings(path: Path) -> Settings:
+    """Read settings, or a definition that leaves out what has a default.
+
+    Raises:
+        UserError: for the first mistake in the file.
+    """
+    return plain.read(Settings, files.load_json(path), path)
+
+
+def ends(variables: Sequence[Context]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the lower and the upper ends of variables."""
+    return tuple(each.low for each in variables), tuple(each.high for each in variables)
+
+
+def _check_range(variable: Context) -> None:
+    if not variable.name.strip():
+        raise UserError(f"name must not be empty, got {variable.name!r}")
+    if not variable.low < variable.high:
+        raise UserError(
+            f"low of {variable.name} must be below high, got {variable.low:g} and {variable.high:g}"
+        )
+
+
+def _check_variables(contexts: Sequence[Context], parameters: Sequence[Parameter]) -> None:
+    for name, variables in (("contexts", contexts), ("parameters", parameters)):
+        if not variables:
+            raise UserError(f"{name} must name at least one")
+    if len(contexts) > MAX_CONTEXTS:
+        raise UserError(f"contexts must be at most {MAX_CONTEXTS}, got {len(contexts)}")
+    names = [variable.name for variable in (*contexts, *parameters)]
+    for name in names:
+        if names.count(name) > 1:
+            raise UserError(f"{name!r} is the name of two variables")
+
+
+def _check_numbers(settings: Settings) -> None:
+    if settings.constraint not in CONSTRAINTS:
+        raise UserError(f"constraint must be one of {', '.join(CONSTRAINTS)}, got {settings.constraint!r}")
+    if (settings.mean_kl_bound is None) != (settings.cov_kl_bound is None):
+        raise UserError(
+            "mean_kl_bound and cov_kl_bound must be numbers both, or null both, "
+            f"got {settings.mean_kl_bound} and {settings.cov_kl_bound}"
+        )
+    for name in ("kl_bound", "mean_kl_bound", "cov_kl_bound"):
+        bound = getattr(settings, name)
+        if bound is not None and not bound > 0:
+            raise UserError(f"{name} must be above zero, got {bound:g}")
+    if not 1 <= settings.batch_size <= MAX_BATCH:
+        raise UserError(f"batch_size must be from 1 to {MAX_BATCH}, got {settings.batch_size}")
+    if settings.archive_size is not None and settings.archive_size < settings.batch_size:
+        raise UserError(
+            f"archive_size must be at least batch_size, {settings.batch_size}, got {settings.archive_size}"
+        )
+    if settings.archive_size is not None and settings.archive_size > MAX_ARCHIVE:
+        raise UserError(f"archive_size must be at most {MAX_ARCHIVE}, got {settings.archive_size}")
+    if not 0 <= settings.seed < 2**32:
+        raise UserError(f"seed must be from 0 to {2**32 - 1}, got {settings.seed}")

@@ -1,0 +1,136 @@
+"""Say where a session begins: with a saved policy, or with the start and the spread of each parameter."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+
+from creps_jax.errors import UserError
+from creps_jax.policies.features import FeatureMap
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.learned import Features, SavedPolicy
+from creps_jax.tools.session.plain import shortest
+from creps_jax.tools.session.settings import Context, FeatureSettings, FirstPolicy, Parameter, Settings, ends
+
+V = TypeVar("V", bound=Context)
+
+
+def settings_from_policy(saved: SavedPolicy, *, exploration: float = 1.0) -> Settings:
+    """Return settings that begin with a policy.
+
+    Args:
+        saved: the policy; one that was learned without a sigmoid is kept in its bounds by clipping.
+        exploration: factor of its standard deviations.
+
+    Raises:
+        UserError: if that is not positive and finite.
+    """
+    if not (exploration > 0 and math.isfinite(exploration)):
+        raise UserError(f"exploration must be above zero and finite, got {exploration}")
+    cov_chol = np.float32(exploration) * np.asarray(saved.cov_chol, np.float32)
+    return Settings(
+        contexts=_variables(
+            Context, saved.context_names, saved.context_units, saved.context_low, saved.context_high
+        ),
+        parameters=_variables(
+            Parameter, saved.param_names, saved.param_units, saved.param_low, saved.param_high
+        ),
+        features=FeatureSettings(**dataclasses.asdict(saved.features)),
+        constraint="sigmoid" if saved.constraint == "sigmoid" else "clip",
+        first_policy=FirstPolicy(
+            coef=tuple(tuple(shortest(row)) for row in saved.coef),
+            cov_chol=tuple(tuple(shortest(row)) for row in cov_chol),
+        ),
+        task=dict(saved.task),
+    )
+
+
+def complete(settings: Settings) -> Settings:
+    """Fill in what a definition may leave open: features, where the search begins, how many trials are kept.
+
+    Raises:
+        UserError: if there are no such features.
+    """
+    if settings.features.num_centers is None:
+        num_centers = {1: 5, 2: 3}.get(len(settings.contexts), 2)
+        features = dataclasses.replace(settings.features, num_centers=num_centers)
+        settings = dataclasses.replace(settings, features=features)
+    if settings.archive_size is None:
+        # An update needs as many trials as there are features and parameters.
+        least = feature_map(settings).size + len(settings.parameters)
+        settings = dataclasses.replace(settings, archive_size=max(5 * settings.batch_size, 2 * least))
+    if settings.first_policy is not None:
+        return settings
+    parameters = [
+        dataclasses.replace(
+            each,
+            start=0.5 * (each.low + each.high) if each.start is None else each.start,
+            spread=0.125 * (each.high - each.low) if each.spread is None else each.spread,
+        )
+        for each in settings.parameters
+    ]
+    return dataclasses.replace(settings, parameters=tuple(parameters))
+
+
+def first_policy(settings: Settings) -> LinearGaussian:
+    """Return the policy that a session begins with, where it is searched.
+
+    Raises:
+        UserError: if its arrays do not fit the settings, or are no Gaussian's in single precision.
+    """
+    given = settings.first_policy
+    coef, cov_chol = _start(settings) if given is None else (given.coef, given.cov_chol)
+    coef, cov_chol = np.array(coef, np.float32), np.array(cov_chol, np.float32)
+    num_params = len(settings.parameters)
+    wanted = (feature_map(settings).size, num_params), (num_params, num_params)
+    if (coef.shape, cov_chol.shape) != wanted:
+        raise UserError(
+            f"the first policy must have coef {wanted[0]} and cov_chol {wanted[1]}, "
+            f"got {coef.shape} and {cov_chol.shape}"
+        )
+    deviation = np.diagonal(cov_chol)
+    if not (np.isfinite(coef).all() and np.isfinite(cov_chol).all() and (deviation > 0).all()):
+        raise UserError(
+            "the first policy must be finite, and the diagonal of its cov_chol above zero, in single "
+            f"precision, got {deviation.tolist()}"
+        )
+    return LinearGaussian(jnp.asarray(coef), jnp.asarray(cov_chol))
+
+
+def _variables(kind: type[V], *columns: Sequence[Any]) -> tuple[V, ...]:
+    fields = ("name", "unit", "low", "high")
+    return tuple(kind(**dict(zip(fields, row, strict=True))) for row in zip(*columns, strict=True))
+
+
+def _start(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+    """Return coefficients and covariance factor of a policy that does not depend on the context."""
+    columns = [(each.start, each.spread, each.low, each.high) for each in settings.parameters]
+    start, spread, low, high = np.array(columns, float).T
+    if settings.constraint == "sigmoid":
+        # The slope of the sigmoid makes the spread, to first order, that of the parameters.
+        share = (start - low) / (high - low)
+        start, spread = np.log(share / (1 - share)), spread / ((high - low) * share * (1 - share))
+    coef = np.tile(start, (feature_map(settings).size, 1))
+    if settings.features.kind == "linear":
+        coef[1:] = 0.0
+    return coef, np.diag(spread)
+
+
+def features_of(settings: Settings) -> Features:
+    """Return the settings of the features, as policies are saved with."""
+    return Features(**dataclasses.asdict(settings.features))
+
+
+def feature_map(settings: Settings) -> FeatureMap:
+    """Return the features of the context.
+
+    Raises:
+        UserError: if there are no such features.
+    """
+    try:
+        return features_of(settings).make(*ends(settings.contexts))
+    except ValueError as error:
+        raise UserError(str(error)) from error

@@ -1,9 +1,0 @@
-"""Learn on a real robot, trial by trial: a search that is kept in a folder, whole at any moment.
-
-Nothing heavy is imported before it is needed: to tell a reward takes no jax.
-"""
-
-from experiments.session.robot_session import RobotSession, Status, Told
-from experiments.session.trials import Trial
-
-__all__ = ["RobotSession", "Status", "Told", "Trial"]

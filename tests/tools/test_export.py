@@ -1,0 +1,292 @@
+"""Policies and walks, taken away: ONNX model and C function do what the policy does, a walk can be played."""
+
+import csv
+import ctypes
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+from creps_jax.errors import UserError
+from creps_jax.files import load_arrays, policies_folder
+from creps_jax.policies.learned import Features, SavedPolicy, load_policy, save_policy
+from creps_jax.robots.nao_geometry import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, MAX_JOINT_SPEED
+from creps_jax.robots.robot import NAO_H25
+from creps_jax.tools.cli import main
+from creps_jax.tools.export.c_header import make_header
+from creps_jax.tools.export.onnx_model import make_model
+
+SHIPPED = policies_folder() / "walk.npz"
+H25 = ("--robot", "nao_h25")
+NAN, INFINITE = float("nan"), float("inf")
+
+
+def make_policy(name: str, features: Features, constraint: str, *, num_contexts: int = 2) -> SavedPolicy:
+    rng = np.random.default_rng(len(name))
+    low, high = (0.1, -5.0)[:num_contexts], (0.6, 5.0)[:num_contexts]
+    # Means of either sign that reach beyond the box.
+    scale = np.ones((features.make(low, high).size, 1))
+    if features.kind == "linear":
+        scale[1:, 0] = 1.0 / np.array(high)
+    return SavedPolicy(
+        coef=(2.0 * scale * rng.normal(size=(len(scale), 3))).astype(np.float32),
+        cov_chol=np.eye(3, dtype=np.float32),
+        features=features,
+        context_names=("speed", "slope")[:num_contexts],
+        context_units=("m/s", "°")[:num_contexts],
+        context_low=low,
+        context_high=high,
+        param_names=("a b", "a-b", 'what?? "\\'),
+        param_units=("m", "", "rad*/s"),
+        param_low=(0.0, -1.0, 1.0),
+        param_high=(2.0, 1.0, 1.5),
+        constraint=constraint,
+        task={"name": name},
+    )
+
+
+POLICIES = {
+    policy.task["name"]: policy
+    for policy in (
+        make_policy("squashed", Features("rbf", 4), "sigmoid"),
+        make_policy("narrow", Features("rbf", 6, bandwidth=0.02), "penalty", num_contexts=1),
+        make_policy("lonely", Features("rbf", 1), "sigmoid", num_contexts=1),
+        make_policy("straight", Features("linear"), "sigmoid"),
+        make_policy("clipped", Features("linear"), "penalty"),
+        make_policy("free", Features("linear"), "none"),
+        load_policy(SHIPPED),
+    )
+}
+
+
+def contexts_of(policy: SavedPolicy) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return contexts, the nearest ones that were learned for, and whether these are the same."""
+    low, high = np.float32(policy.context_low), np.float32(policy.context_high)
+    rng = np.random.default_rng(0)
+    inside = low + (high - low) * rng.uniform(size=(12, len(low))).astype(np.float32)
+    inside = np.concatenate([np.clip(inside, low, high), [low, high]])
+    outside = np.tile(inside[0], (6, 1))
+    outside[:, -1] = [np.nextafter(low[-1], -INFINITE), 2 * high[-1], -INFINITE, INFINITE, NAN, -NAN]
+    contexts = np.concatenate([inside, outside]).astype(np.float32)
+    nearest = np.clip(np.where(np.isnan(contexts), low, contexts), low, high)
+    return contexts, nearest, np.arange(len(contexts)) < len(inside)
+
+
+def assert_same(policy: SavedPolicy, run) -> None:
+    """Hold `run`, from contexts to parameters and in_range, against the policy's theta."""
+    contexts, nearest, expected = contexts_of(policy)
+    parameters, in_range = run(contexts)
+    theta = np.array([policy.theta(*row.tolist()) for row in nearest])
+    low, high = np.float32(policy.param_low), np.float32(policy.param_high)
+    np.testing.assert_array_less(np.abs(parameters - theta) / (high - low), 1e-6)
+    np.testing.assert_array_equal(in_range, expected)
+    if policy.constraint != "none":
+        assert ((parameters >= low) & (parameters <= high)).all()
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_the_onnx_model_computes_theta(name):
+    policy = POLICIES[name]
+    model = make_model(policy)
+    onnx.checker.check_model(model, full_check=True)
+    assert (model.ir_version, model.opset_import[0].version) == (7, 13)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
+    assert_same(policy, lambda contexts: session.run(["parameters", "in_range"], {"context": contexts}))
+    known = session.get_modelmeta().custom_metadata_map
+    for ours, field in (("parameter", "param"), ("context", "context")):
+        for what in ("names", "units", "low", "high"):
+            assert json.loads(known[f"{ours}_{what}"]) == list(getattr(policy, f"{field}_{what}"))
+    assert json.loads(known["task"]) == policy.task
+    assert f"task {name}" in model.doc_string and "speed 0.1 to 0.6 m/s" in model.doc_string
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory):
+    """Compile all headers together, with a function and a string for each that ctypes can reach."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler: there is no cc on the PATH")
+    folder = tmp_path_factory.mktemp("c")
+    source = ""
+    for name, policy in POLICIES.items():
+        (folder / f"{name}.h").write_text(make_header(policy))
+        source += f"""
+            #include "{name}.h"
+            #include "{name}.h"
+            int run_{name}(const float *c, float *p) {{ return {name}_policy(c, p); }}
+            const char *last_name_of_{name}(void) {{
+                return {name}_parameter_names[{name.upper()}_NUM_PARAMETERS - 1];
+            }}
+        """
+    (folder / "all.c").write_text("\n".join(map(str.strip, source.splitlines())))
+    library = folder / "all.so"
+    command = [compiler, "-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
+    subprocess.run([*command, folder / "all.c", "-o", library, "-lm"], check=True, timeout=120)
+    return ctypes.CDLL(str(library))
+
+
+def as_floats(array: np.ndarray):
+    return array.ctypes.data_as(ctypes.POINTER(ctypes.c_float))
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_the_c_function_computes_theta(compiled, name):
+    policy = POLICIES[name]
+
+    def run(contexts):
+        parameters = np.full((len(contexts), len(policy.param_names)), NAN, np.float32)
+        in_range = [
+            getattr(compiled, f"run_{name}")(as_floats(context), as_floats(row))
+            for context, row in zip(contexts, parameters, strict=True)
+        ]
+        return parameters, in_range
+
+    assert_same(policy, run)
+    last_name = getattr(compiled, f"last_name_of_{name}")
+    last_name.restype = ctypes.c_char_p
+    assert last_name().decode() == policy.param_names[-1]
+
+
+def test_the_header_is_c_plus_plus_too(tmp_path):
+    compiler = shutil.which("c++")
+    if compiler is None:
+        pytest.skip("no C++ compiler: there is no c++ on the PATH")
+    (tmp_path / "walk.h").write_text(make_header(POLICIES["walk"]))
+    (tmp_path / "main.cc").write_text(
+        '#include "walk.h"\n'
+        "int main() { float c[] = {0.3f}, p[WALK_NUM_PARAMETERS]; return walk_policy(c, p); }\n"
+    )
+    command = [compiler, "-Wall", "-Wextra", "-Werror", "-fsyntax-only", tmp_path / "main.cc"]
+    subprocess.run(command, check=True, timeout=120)
+
+
+def test_the_header_says_what_the_policy_is():
+    policy = POLICIES["walk"]
+    header = make_header(policy)
+    assert header.count("#ifndef WALK_POLICY_H\n#define WALK_POLICY_H\n") == 1
+    assert "#define WALK_NUM_CONTEXTS 1\n#define WALK_NUM_PARAMETERS 10\n" in header
+    assert "Returns 1 if the context is within" in header and "Returns 0 if" in header
+    tables = dict(re.findall(r"(\w+)(?:\[\w+\])+ = \{\n(.*?)\n\};", header, flags=re.DOTALL))
+    floats = {
+        name: [np.float32(number) for number in re.findall(r"(-?\d[^\s,{}]*)f\b", body)]
+        for name, body in tables.items()
+    }
+    # Every number reads back as the same float.
+    assert floats["walk_coef"] == policy.coef.ravel().tolist()
+    assert floats["walk_context_low"] + floats["walk_context_high"] == [np.float32(0.1), np.float32(0.6)]
+    assert floats["walk_parameter_low"] == np.float32(policy.param_low).tolist()
+    assert floats["walk_parameter_high"] == np.float32(policy.param_high).tolist()
+    assert re.findall('"(.*)"', tables["walk_parameter_names"]) == list(policy.param_names)
+    assert re.findall('"(.*)"', tables["walk_parameter_units"]) == list(policy.param_units)
+    enum = re.search(r"enum walk_parameter \{(.*?)\}", header, flags=re.DOTALL)
+    assert enum and enum[1].split(",")[3].strip() == "WALK_PARAMETER_STEP_DURATION"
+    assert header.isascii() and max(map(len, header.splitlines())) <= 110
+
+
+@pytest.mark.parametrize(
+    ("task", "function"),
+    [
+        ({"name": "3-D arm"}, "task_3_d_arm_policy"),
+        ({"name": "reach/hole"}, "reach_hole_policy"),
+        ({"name": "θ"}, "learned_policy"),
+        ({}, "learned_policy"),
+    ],
+)
+def test_names_in_c_are_identifiers(task, function):
+    header = make_header(dataclasses.replace(POLICIES["free"], task=task))
+    assert f"static inline int {function}(" in header
+    # Two parameters whose names become the same are told apart by their index.
+    assert "PARAMETER_A_B_0,\n" in header and "PARAMETER_A_B_1,\n" in header
+
+
+@pytest.mark.parametrize("make", [make_model, make_header])
+def test_numbers_beyond_single_precision_are_refused(make):
+    with pytest.raises(UserError, match="param_high of the policy is too large for single precision"):
+        make(dataclasses.replace(POLICIES["free"], param_high=(2.0, 1e300, 1.5)))
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch) -> Path:
+    """Work in an empty folder, without results, so that the default is the shipped policy."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_command_writes_policies(folder, capsys):
+    (folder / "walk.h").write_text("old")
+    assert main(["export", "--to", "walk.h"]) == 0
+    assert (folder / "walk.h").read_text() == make_header(POLICIES["walk"])
+    assert capsys.readouterr().out == f"policy: {SHIPPED}\nC header: walk.h\n"
+    save_policy(folder / "reach.npz", POLICIES["squashed"])
+    assert main(["export", "--policy", "reach.npz", "--to", "new/reach.ONNX"]) == 0
+    assert onnx.load(folder / "new" / "reach.ONNX") == make_model(POLICIES["squashed"])
+    assert {path.name for path in folder.rglob("*")} == {"walk.h", "reach.npz", "new", "reach.ONNX"}
+
+
+def test_the_command_writes_the_set_points_of_a_walk(folder):
+    for ending in ("csv", "npz"):
+        assert main(["export", "--to", f"walk.{ending}", "--speed", "0.3", "--duration", "1"]) == 0
+    arrays = load_arrays(folder / "walk.npz")
+    time, set_point = arrays["time"], arrays["set_point"]
+    np.testing.assert_allclose(time, np.arange(51) * 0.02)
+    assert float(arrays["speed"]) == 0.3 and tuple(arrays["joint_names"]) == JOINT_NAMES
+    assert set_point.shape == (51, 22)
+    assert ((set_point >= np.float32(JOINT_LOWER)) & (set_point <= np.float32(JOINT_UPPER))).all()
+    assert 0.01 < np.abs(np.diff(set_point, axis=0)).max() <= 1.0001 * MAX_JOINT_SPEED * 0.02
+    with (folder / "walk.csv").open() as file:
+        header, *rows = csv.reader(file)
+    assert header == ["time (s)", *(f"{name} (rad)" for name in JOINT_NAMES)]
+    np.testing.assert_allclose([float(row[0]) for row in rows], time, atol=1e-9)
+    np.testing.assert_array_equal(np.array(rows)[:, 1:].astype(np.float32), set_point)
+
+
+def test_a_robot_gets_its_own_policy_and_set_points(folder, capsys):
+    assert main(["export", "--robot", "nao_h25", "--to", "h25.npz", "--speed", "0.2", "--duration", "1"]) == 0
+    shipped = policies_folder("nao_h25") / "walk.npz"
+    assert capsys.readouterr().out.splitlines()[0] == f"policy: {shipped}"
+    set_point = load_arrays(folder / "h25.npz")["set_point"]
+    low, high = np.float32(NAO_H25.joint_lower), np.float32(NAO_H25.joint_upper)
+    assert ((set_point >= low) & (set_point <= high)).all()
+    # Its elbows do not stretch, and one motor turns both hips.
+    assert low[JOINT_NAMES.index("right_elbow")] > 0
+    left, right = (set_point[:, JOINT_NAMES.index(f"{side}_hip_yaw_pitch")] for side in ("left", "right"))
+    np.testing.assert_allclose(left, right, atol=1e-6)
+    assert main(["export", "--robot", "nao_h25", "--to", "h25.h"]) == 0
+    assert (folder / "h25.h").read_text() == make_header(load_policy(shipped))
+
+
+def test_mistakes_are_one_clear_line(folder, capsys):
+    other = dataclasses.replace(POLICIES["walk"], task={**POLICIES["walk"].task, "name": "swim"})
+    for name, policy in (("reach", POLICIES["squashed"]), ("walk", POLICIES["walk"]), ("swim", other)):
+        save_policy(folder / f"{name}.npz", policy)
+    (folder / "file").touch()
+    (folder / "folder.h").mkdir()
+    walk = ["--to", "walk.csv", "--speed", "0.3"]
+    for match, arguments in (
+        ("cannot write file/walk.h", ["--to", "file/walk.h"]),
+        ("cannot write folder.h: Is a directory", ["--to", "folder.h"]),
+        ("no such file: none.npz", ["--to", "walk.h", "--policy", "none.npz"]),
+        ("is no walking policy: its parameters are a b, a-b", [*walk, "--policy", "reach.npz"]),
+        ("is no walking policy: its task is 'swim'", [*walk, "--policy", "swim.npz"]),
+        (f"{SHIPPED} is a policy of the robot nao, not of", [*walk, "--policy", str(SHIPPED), *H25]),
+        ("is a policy of the robot nao, not of nao_h25", ["--to", "w.h", "--policy", str(SHIPPED), *H25]),
+        ("learned range, 0.1 to 0.6 m/s, got 0.9", ["--to", "walk.csv", "--speed", "0.9"]),
+        ("--duration must be 0.02 to 600 s, got 0.0", [*walk, "--duration", "0"]),
+        ("--duration must be 0.02 to 600 s, got nan", [*walk, "--duration", "nan"]),
+        ("is the policy file itself", ["--to", "walk.npz", "--speed", "0.3", "--policy", "./walk.npz"]),
+    ):
+        assert main(["export", *arguments]) == 2, match
+        error = capsys.readouterr().err
+        assert match in error
+        assert len(error.splitlines()) == 1
+    assert not (folder / "walk.csv").exists()
+    load_policy(folder / "walk.npz")
