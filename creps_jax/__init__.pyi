@@ -3,7 +3,8 @@ from .contexts import context_grid, gaussian_contexts, uniform_contexts
 from .numerics.linalg import thomas_solve
 from .policies.features import FeatureMap, linear_features, quadratic_features, rbf_features
 from .policies.gaussian import LinearGaussian, fit_weighted_ml
-from .policies.space import sigmoid_gate
+from .policies.learned import Learned, load, save
+from .policies.space import Space, sigmoid_gate
 from .robots.nao_kinematics import leg_fk, leg_ik
 from .search.archive import Archive, Batch
 from .search.creps import Creps, CrepsInfo, CrepsState, creps
@@ -17,6 +18,8 @@ from .tasks.walking import nao_walk
 from .training import IterationLog, evaluate, make_iteration, train, train_trials
 from .walking.com import com_trajectory
 
+__version__: str
+
 __all__ = [
     "Archive",
     "Batch",
@@ -27,8 +30,10 @@ __all__ = [
     "FeatureMap",
     "Importance",
     "IterationLog",
+    "Learned",
     "LinearGaussian",
     "Outcome",
+    "Space",
     "Task",
     "average_repeats",
     "bounded_ml",
@@ -42,6 +47,7 @@ __all__ = [
     "leg_fk",
     "leg_ik",
     "linear_features",
+    "load",
     "make_iteration",
     "nao_walk",
     "numerics",
@@ -51,6 +57,7 @@ __all__ = [
     "rbf_features",
     "robots",
     "sample_weights",
+    "save",
     "search",
     "sigmoid_constrained",
     "sigmoid_gate",

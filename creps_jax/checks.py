@@ -10,7 +10,7 @@ import inspect
 import math
 import numbers
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
 
@@ -114,18 +114,32 @@ def count(name: str, value: Any, *, least: int = 1) -> int:
     return int(value)
 
 
-def grid(name: str, num: Any, dim: int, *, least: int = 1) -> int:
+def grid(name: str, num: Any, dim: int, *, least: int = 1) -> tuple[int, ...]:
     """Return how many points a grid has along each of its `dim` axes, after checking that all fit in memory.
 
+    Args:
+        name: What errors call the number.
+        num: One number for all axes, or a sequence with one for each.
+        dim: Number of axes.
+        least: The least number along an axis.
+
     Raises:
-        ValueError: If `num` is less than `least`, or there are too many points.
+        ValueError: If a number is less than `least`, there is not one for each axis, or there are too many
+            points.
     """
-    num = count(name, num, least=least)
-    if num**dim > _MOST_POINTS:
-        raise ValueError(
-            f"{name} must leave at most {_MOST_POINTS} points in all, got {num} along each of {dim} axes"
-        )
-    return num
+    is_one = not isinstance(num, Sequence | np.ndarray) or isinstance(num, str)
+    if is_one:
+        nums = (count(name, num, least=least),) * dim
+    elif all(isinstance(value, numbers.Integral) and least <= int(value) <= _MOST for value in num):
+        nums = tuple(map(int, num))
+    else:
+        raise ValueError(f"{name} must be whole numbers of at least {least}, got {shown(num)}")
+    if len(nums) != dim:
+        raise ValueError(f"{name} must be one number or {dim}, one for each axis, got {shown(num)}")
+    if math.prod(nums) > _MOST_POINTS:
+        each = f" along each of {dim} axes" if is_one else ""
+        raise ValueError(f"{name} must leave at most {_MOST_POINTS} points in all, got {num}{each}")
+    return nums
 
 
 def number(name: str, value: Any, *, least: float = -math.inf, above: float = -math.inf) -> Any:

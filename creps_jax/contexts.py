@@ -1,7 +1,7 @@
 """Draw contexts to learn from, and lay out contexts to evaluate on."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -65,25 +65,28 @@ def uniform_contexts(low: VectorLike, high: VectorLike) -> Sampler:
 
 
 @checks.arguments
-def context_grid(low: VectorLike, high: VectorLike, num: int) -> Float[Array, "n s"]:
+def context_grid(low: VectorLike, high: VectorLike, num: int | Sequence[int]) -> Float[Array, "n s"]:
     """Lay out contexts evenly over a range, both ends included, to evaluate a policy on.
 
     Args:
         low: Lower end of each context's range; a number is a context of one dimension.
         high: Upper end of each context's range.
-        num: Number of contexts along each of the s dimensions.
+        num: Number of contexts along each of the s dimensions: one for all, or one for each.
 
     Returns:
-        All `num ** s` combinations, the last dimension varying fastest.
+        All combinations, `num ** s` for one number, the last dimension varying fastest.
 
     Raises:
         ValueError: If the ends do not fit each other, or `num` is less than 2 or far too many.
     """
     low, high = _checked_range(low, high)
-    num = checks.grid("num", num, low.size, least=2)
+    counts = checks.grid("num", num, low.size, least=2)
     half = _halves(low, high)
     ends = zip(low * half, high * half, strict=True)
-    axes = [np.linspace(start, stop, num, dtype=np.float32) for start, stop in ends]
+    axes = [
+        np.linspace(start, stop, count, dtype=np.float32)
+        for (start, stop), count in zip(ends, counts, strict=True)
+    ]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
     return jnp.asarray(grid / half)
 

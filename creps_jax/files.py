@@ -2,9 +2,11 @@
 
 import contextlib
 import errno
+import importlib.metadata
 import json
 import os
 import tempfile
+import tomllib
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
@@ -14,6 +16,16 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from creps_jax.errors import UserError
+
+
+def package_version() -> str:
+    """Return the version of creps_jax, installed or not."""
+    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version("creps_jax")
+    with contextlib.suppress(OSError, KeyError, tomllib.TOMLDecodeError):
+        project = Path(__file__).parents[1] / "pyproject.toml"
+        return tomllib.loads(project.read_text())["project"]["version"]
+    return "unknown"
 
 
 def models_folder() -> Path:

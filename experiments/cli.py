@@ -161,8 +161,9 @@ def _run(name: str, arguments: list[str]) -> int:
     from experiments import runner
 
     experiment = registry.load(name)
+    folder = runner.folder_to_resume(name, early.out, early.robot) if early.resume else early.out
     default = runner.default_settings(
-        experiment, name, preset=early.preset, config=early.config, out=early.out, resume=early.resume
+        experiment, name, preset=early.preset, config=early.config, out=folder, resume=early.resume
     )
     options, settings = _options_and_settings(experiment, name, arguments, default)
     check_seed(options.seed)
@@ -172,7 +173,7 @@ def _run(name: str, arguments: list[str]) -> int:
         config=options.config,
         seed=options.seed,
         settings=settings,
-        out=options.out,
+        out=folder,
         resume=options.resume,
     )
     # A run that is told to end saves what it has, as one that is interrupted does.
@@ -186,7 +187,8 @@ def _early_options(arguments: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("config", "out"):
         parser.add_argument(f"--{name}", type=Path)
-    parser.add_argument("--preset")
+    for name in ("preset", "robot"):
+        parser.add_argument(f"--{name}")
     for name in ("resume", "distributed"):
         parser.add_argument(f"--{name}", action="store_true")
     try:

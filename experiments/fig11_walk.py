@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from matplotlib.figure import Figure
 
-from creps_jax.policies.learned import Features
+from creps_jax.policies.feature_settings import Features
 from creps_jax.tools import plots
 from creps_jax.tools.tables import PAPER_LINEAR, PAPER_RBF, save_table
 from experiments import comparison, walk

@@ -38,8 +38,8 @@ class Request:
             that is resumed its own.
         config: the manifest that they began with, in place of a preset.
         seed: seed of the random key; None is that of `config` or of the run that is resumed, or else 0.
-        out: the result folder; None is a new one, or the one of the latest run that has not finished.
-        resume: whether to go on with the run in `out`.
+        out: the result folder; None is a new one.
+        resume: whether to go on with the run in `out`, see `folder_to_resume`.
     """
 
     name: str
@@ -70,13 +70,38 @@ def default_settings(
     if config is not None and (preset is not None or resume):
         raise UserError("--config names all settings of a run: it does not go with --preset and --resume")
     if resume:
-        return _settings_of(experiment, folder := _folder_to_resume(name, out), results.load_manifest(folder))
+        folder = folder_to_resume(name, out)
+        return _settings_of(experiment, folder, results.load_manifest(folder))
     if config is not None:
         manifest = results.load_manifest_file(config)
         if manifest.get("experiment") != name:
             raise UserError(f"{config} is of {manifest.get('experiment')!r}, expected {name!r}")
         return _settings_of(experiment, config, manifest)
     return registry.preset_settings(experiment, preset or next(iter(experiment.SETTINGS)))
+
+
+def folder_to_resume(name: str, out: Path | None, robot: str | None = None) -> Path:
+    """Return the folder of a run to go on with: the named one, or that of the latest unfinished run.
+
+    Args:
+        name: the experiment.
+        out: the named folder.
+        robot: whose run; None is anyone's.
+
+    Raises:
+        UserError: if no run is unfinished.
+    """
+    if out is not None:
+        return out
+    found = [
+        results.latest_folder(name, status=status, robot=robot)
+        for status in ("running", "interrupted", "failed")
+    ]
+    folder = max((path for path in found if path is not None), default=None, key=lambda path: path.name)
+    if folder is None:
+        asked = "" if robot is None else f" with the robot {robot}"
+        raise UserError(f"there is no unfinished run of {name}{asked} in {results.default_root()}")
+    return folder
 
 
 def run(request: Request, *, console: Console | None, say: Say) -> Path:
@@ -249,20 +274,9 @@ def _resolved(request: Request) -> tuple[Any, int]:
     return settings.resolved() if hasattr(settings, "resolved") else settings, seed or 0
 
 
-def _folder_to_resume(name: str, out: Path | None) -> Path:
-    """Return the folder of a run to go on with: the named one, or that of the latest unfinished run."""
-    if out is not None:
-        return out
-    found = [results.latest_folder(name, status=status) for status in ("running", "interrupted", "failed")]
-    folder = max((path for path in found if path is not None), default=None, key=lambda path: path.name)
-    if folder is None:
-        raise UserError(f"there is no unfinished run of {name} in {results.default_root()}")
-    return folder
-
-
 def _resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Path, dict[str, Any]]:
     """Return settings, folder and manifest of a run to go on with."""
-    folder = _folder_to_resume(request.name, request.out)
+    folder = folder_to_resume(request.name, request.out)
     manifest = results.load_manifest(folder)
     for field, kind in (("seed", int), ("seconds", float | int)):
         if not isinstance(manifest.get(field), kind):

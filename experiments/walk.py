@@ -15,10 +15,11 @@ from matplotlib.figure import Figure
 from creps_jax import files
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.errors import UserError
+from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian
-from creps_jax.policies.learned import Features, SavedPolicy, save_policy
-from creps_jax.policies.space import sigmoid_gate
+from creps_jax.policies.learned import Learned
+from creps_jax.policies.space import Space, sigmoid_gate
 from creps_jax.search.creps import Creps, CrepsState, creps
 from creps_jax.search.fit import fit_within
 from creps_jax.simulation import c, mjx
@@ -246,7 +247,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     speeds, outcome = walk_at_all_speeds(settings, evaluate_key, policy)
     fine = settings.speeds(51)
     policies = [
-        saved_policy(settings, LinearGaussian(*pair)) for pair in zip(*map(np.asarray, policy), strict=True)
+        as_learned(settings, LinearGaussian(*pair)) for pair in zip(*map(np.asarray, policy), strict=True)
     ]
     return {
         **learned(settings, policy, log),
@@ -392,30 +393,28 @@ def evaluate_trials(
     return jax.tree.map(lambda leaf: np.asarray(leaf).reshape(trials, num, *leaf.shape[1:]), outcome)
 
 
-def physical(settings: Settings, free: np.ndarray) -> np.ndarray:
-    """Turn parameters (..., d) as a squashed policy gives them into those that the robot walks with."""
-    return np.asarray(sigmoid_gate(jnp.asarray(free), *map(jnp.asarray, settings.box())))
+def parameter_space(settings: Settings) -> Space:
+    """Return the walking parameters with their bounds."""
+    low, high = settings.box()
+    constraint = "sigmoid" if settings.constraint == "sigmoid" else "clip"
+    return Space(PARAM_NAMES, low, high, PARAM_UNITS, constraint)
 
 
-def saved_policy(settings: Settings, policy: LinearGaussian) -> SavedPolicy:
+def as_learned(settings: Settings, policy: LinearGaussian) -> Learned:
     """Put a policy together with all that is needed to use it."""
     conditions = settings.conditions()
-    context_low, context_high = settings.context_range()
-    low, high = settings.box()
-    return SavedPolicy(
-        coef=np.asarray(policy.coef),
-        cov_chol=np.asarray(policy.cov_chol),
-        features=settings.features,
-        context_names=("speed", *(condition.name for condition in conditions)),
-        context_units=("m/s", *(condition.unit for condition in conditions)),
-        context_low=context_low,
-        context_high=context_high,
-        param_names=PARAM_NAMES,
-        param_units=PARAM_UNITS,
-        param_low=low,
-        param_high=high,
-        constraint="sigmoid",
-        task={"name": "walk", "balance": settings.balance()._asdict(), "robot": settings.robot},
+    low, high = settings.context_range()
+    return Learned(
+        policy,
+        settings.features.make(low, high),
+        Space(
+            ("speed", *(condition.name for condition in conditions)),
+            low,
+            high,
+            ("m/s", *(condition.unit for condition in conditions)),
+        ),
+        parameter_space(settings),
+        {"name": "walk", "balance": settings.balance()._asdict(), "robot": settings.robot},
     )
 
 
@@ -477,8 +476,8 @@ def finish(
 ) -> None:
     """Write policy, table and video of the chosen trial."""
     trial = chosen_trial(arrays)
-    policy = saved_policy(settings, LinearGaussian(arrays["coef"][trial], arrays["cov_chol"][trial]))
-    save_policy(folder / POLICY, policy)
+    policy = as_learned(settings, LinearGaussian(arrays["coef"][trial], arrays["cov_chol"][trial]))
+    policy.save(folder / POLICY)
     say(f"policy: {folder / POLICY}")
     columns = tables.speed_table(
         arrays["speeds"], arrays["reward"][trial], arrays["speed"][trial], arrays["fell"][trial]

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 from creps_jax.contexts import context_grid
 from creps_jax.errors import UserError
 from creps_jax.files import policies_folder
+from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.gaussian import LinearGaussian
-from creps_jax.policies.learned import Features, load_policy, save_policy
+from creps_jax.policies.learned import load
 from creps_jax.tasks.conditions import Condition, slope
 from creps_jax.tools import plots, tables
 from creps_jax.tools.play import POLICY, record, save_film
@@ -119,8 +120,8 @@ def walk_everywhere(settings: Settings, key: jax.Array, policy: LinearGaussian) 
     free = np.asarray(jax.vmap(walk.make_algorithm(settings).mean, (0, None))(policy, contexts))
     task = walk.make_task(settings)
     outcome = walk.evaluate_trials(key, task, contexts, free, repeats=settings.eval_seeds)
-    found = {"theta": walk.physical(settings, free), "reward": outcome.reward}
-    found |= {"speed": outcome.speed, "fell": outcome.fell}
+    theta = np.asarray(walk.parameter_space(settings).inside(jnp.asarray(free)))
+    found = {"theta": theta, "reward": outcome.reward, "speed": outcome.speed, "fell": outcome.fell}
     grid = (len(free), len(speeds), len(slopes))
     return {name: values.reshape(*grid, *values.shape[2:]) for name, values in found.items()}
 
@@ -132,8 +133,9 @@ def warm_start(settings: Settings) -> LinearGaussian:
         UserError: if it keeps its parameters within other bounds.
     """
     path = policies_folder() / "walk.npz"
-    shipped = load_policy(path)
-    if shipped.constraint != settings.constraint or (shipped.param_low, shipped.param_high) != settings.box():
+    shipped = load(path)
+    space = shipped.parameters
+    if (space.constraint, space.low, space.high) != (settings.constraint, *settings.box()):
         wanted = settings.bounds or settings.robot
         raise UserError(f"{path} has other bounds than {settings.constraint} within {wanted}")
     contexts = context_grid(*settings.context_range(), _FITTED)
@@ -198,8 +200,8 @@ def finish(
 ) -> None:
     """Write policy, table and video of the chosen trial."""
     trial = walk.chosen_trial(arrays)
-    policy = walk.saved_policy(settings, LinearGaussian(arrays["coef"][trial], arrays["cov_chol"][trial]))
-    save_policy(folder / POLICY, policy)
+    policy = walk.as_learned(settings, LinearGaussian(arrays["coef"][trial], arrays["cov_chol"][trial]))
+    policy.save(folder / POLICY)
     say(f"policy: {folder / POLICY}\n")
     tables.save_table(table(arrays), folder, say)
     speeds, slopes = zip(*FILMED, strict=True)

@@ -37,7 +37,7 @@ import_mjx_quietly()
 import matplotlib.pyplot as plt
 import numpy as np
 
-from creps_jax.policies.learned import load_policy
+from creps_jax.policies.learned import load
 from creps_jax.tools.play import record
 from creps_jax.tools.plots import PAPER_COLOUR, parameters_against_context
 
@@ -49,7 +49,7 @@ from creps_jax.tools.plots import PAPER_COLOUR, parameters_against_context
 # steps to go faster, then quicker ones. The dotted lines are bounds.
 
 # %%
-policy = load_policy(ROOT / "models" / "nao" / "policies" / "walk.npz")
+policy = load(ROOT / "models" / "nao" / "policies" / "walk.npz")
 speeds = np.linspace(0.1, 0.6, 26)
 parameters_against_context(
     speeds,

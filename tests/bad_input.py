@@ -12,6 +12,7 @@ import inspect
 import math
 import os
 import re
+import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -25,13 +26,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import creps_jax as cj
-from creps_jax import rotations, tasks
+from creps_jax import tasks
+from creps_jax.numerics import rotations
 from creps_jax.policies.features import polynomial_features
 from creps_jax.robots import nao_geometry, nao_kinematics
 from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.search.archive import push
 from creps_jax.search.dual import DualSolution
-from creps_jax.search.fit import WeightedSamples, weighted_ml
+from creps_jax.search.fit import WeightedSamples, fit_within, weighted_ml
 from creps_jax.simulation import c, fit, mjx, servos, world
 from creps_jax.simulation import state as physics_state
 from creps_jax.tasks import conditions, dmp, functions, planar_arm
@@ -325,6 +327,11 @@ RUN = {
     "devices": DEVICES,
 }
 
+SPEED = cj.Space(("speed",), (0.0,), (1.0,), ("m/s",))
+LEARNED = cj.Learned(POLICY, FEATURES, SPEED, cj.Space(("a", "b"), (0.0, 0.0), (1.0, 1.0)))
+FOLDER = Path(tempfile.mkdtemp())
+LEARNED.save(FOLDER / "policy.npz")
+NO_PATH = one_of((None, "None"), (5, "5"), (["a"], "['a']"))
 MODEL = load_nao()
 WALK = params.params_from_theta(jnp.asarray(np.mean(params.NAO_BOUNDS, axis=0), jnp.float32))
 PLANS = jax.eval_shape(lambda: engine.plan_walk(WALK, 3))
@@ -622,6 +629,21 @@ ROWS = {
     "leg_reach": row(nao_kinematics.leg_reach, robot=record(NAO)),
     "leg_ik of a shared motor": row(
         partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))
+    ),
+    "Learned()": row(lambda values: list(LEARNED(values).values()), values=number(0.3)),
+    "Space.contains": row(SPEED.contains, values=vector((0.3,))),
+    "load": row(cj.load, use=lambda learned: learned.policy, path=Argument(FOLDER / "policy.npz", NO_PATH)),
+    "save": row(
+        cj.save,
+        use=lambda _: 0,
+        path=Argument(FOLDER / "again.npz", NO_PATH),
+        learned=record(LEARNED),
+    ),
+    "fit_within": row(
+        fit_within,
+        use=lambda _: 0,
+        mean_kl_bound=number(0.5, above=0.0),
+        cov_kl_bound=number(0.05, above=0.0),
     ),
     "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
     "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),

@@ -25,8 +25,11 @@ from jaxtyping import install_import_hook
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# Every annotated function of the library is checked against the shapes and types it promises.
-install_import_hook("creps_jax", "beartype.beartype")
+# Every annotated function of the library is checked against the shapes and types it promises; the tools take
+# what people type, and answer mistakes themselves.
+ROOMS = ("numerics", "policies", "robots", "search", "simulation", "tasks", "walking")
+MODULES = ("checks", "contexts", "keys", "rollouts", "training")
+install_import_hook([f"creps_jax.{name}" for name in (*ROOMS, *MODULES)], "beartype.beartype")
 
 # Importing MJX writes to stdout that Warp is missing; do it once here, where doctests cannot see it.
 with contextlib.redirect_stdout(io.StringIO()):

@@ -147,5 +147,5 @@ def test_mujoco_is_imported_only_for_the_walking_task_which_stays_a_function(ord
     assert result.returncode == 0, result.stderr
 
 
-def test_the_library_has_at_most_forty_names():
-    assert len(creps_jax.__all__) == len(set(creps_jax.__all__)) <= 40
+def test_the_library_has_at_most_sixty_names():
+    assert len(creps_jax.__all__) == len(set(creps_jax.__all__)) <= 60

@@ -7,8 +7,8 @@ pickled.
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,14 +40,34 @@ _MOST_FEATURES = 1_000_000
 
 
 class FeatureMap(NamedTuple):
-    """Hold a function from a context (context_dim,) to features (size,), and both numbers."""
+    """Hold a function from a context to features, and the numbers of both.
+
+    Call it with a context (s,) for features (m,), or with contexts (n, s) for features (n, m).
+    """
 
     apply: Callable[[Float[Array, " s"]], Float[Array, " m"]]
+    """Of one context."""
     size: int
     context_dim: int
     scale: tuple[float, ...] | None = None
-    """How large each feature can get, which penalties on its coefficients are relative to; None where it has
-    a unit, and its size on the samples has to do."""
+    """The largest value of each feature, which penalties on its coefficients are relative to; None: the
+    standard deviation over the samples."""
+    constant: tuple[float, ...] | None = None
+    """Coefficients whose sum with the features is one for every context; None where there are none."""
+    name: str | None = None
+    """A name, by which policies with features of your own are saved and loaded."""
+
+    def __call__(self, contexts: Float[Array, "*n s"]) -> Float[Array, "*n m"]:
+        """Compute the features of a context, or of each row of contexts.
+
+        Raises:
+            ValueError: If a context has not `context_dim` variables.
+        """
+        contexts = checks.array("contexts", contexts)
+        apply = self.apply
+        for _ in range(contexts.ndim - 1):
+            apply = jax.vmap(apply)
+        return apply(contexts)
 
 
 @checks.arguments
@@ -65,7 +85,7 @@ def linear_features(dim: int) -> FeatureMap:
 
     Source: Abdolmaleki et al. 2016, text below Eq. 15.
     """
-    return FeatureMap(_Linear(dim), 1 + dim, dim)
+    return FeatureMap(_Linear(dim), 1 + dim, dim, constant=(1.0,) + (0.0,) * dim)
 
 
 @checks.arguments
@@ -114,11 +134,15 @@ def polynomial_features(dim: int, degree: int) -> FeatureMap:
         raise ValueError(
             f"dim and degree must leave at most {_MOST_FEATURES} features, got {dim} and {degree}"
         )
-    return FeatureMap(_Polynomial(dim, degree), int(size), dim)
+    return FeatureMap(_Polynomial(dim, degree), int(size), dim, constant=(1.0,) + (0.0,) * (int(size) - 1))
 
 
 def rbf_features(
-    low: VectorLike, high: VectorLike, num_centers: int, *, bandwidth: VectorLike | None = None
+    low: VectorLike,
+    high: VectorLike,
+    num_centers: int | Sequence[int],
+    *,
+    bandwidth: VectorLike | None = None,
 ) -> FeatureMap:
     """Make normalised radial basis functions on a full grid of centres.
 
@@ -128,11 +152,12 @@ def rbf_features(
     Args:
         low: Lower end of the range of each context variable.
         high: Upper end of the range of each context variable.
-        num_centers: Number of centres K along each context variable.
+        num_centers: Number of centres K along each context variable: one for all, or one for each.
         bandwidth: Width sigma along each context variable, in its unit; (high - low) / K by default.
 
     Returns:
-        The map to K^dim features, the last context variable changing fastest.
+        The map to as many features as there are centres, K^dim for one K, the last context variable changing
+        fastest.
 
     Raises:
         ValueError: If the settings differ in length, a number is not finite, low >= high, num_centers < 1 or
@@ -141,14 +166,18 @@ def rbf_features(
     Source: Abdolmaleki et al. 2016, Eq. 16. The paper prints the default width for sigma squared, whose unit
     it does not have.
     """
-    lows, highs, widths = _rbf_settings(low, high, num_centers, bandwidth)
-    radial = _Radial(tuple(lows.tolist()), tuple(highs.tolist()), int(num_centers), tuple(widths.tolist()))
-    size = radial.num_centers**lows.size
-    return FeatureMap(radial, size, lows.size, scale=(1.0,) * size)
+    lows, highs, counts, widths = _rbf_settings(low, high, num_centers, bandwidth)
+    radial = _Radial(tuple(lows.tolist()), tuple(highs.tolist()), counts, tuple(widths.tolist()))
+    size = math.prod(counts)
+    return FeatureMap(radial, size, lows.size, scale=(1.0,) * size, constant=(1.0,) * size)
 
 
 def rbf_grid(
-    low: VectorLike, high: VectorLike, num_centers: int, *, bandwidth: VectorLike | None = None
+    low: VectorLike,
+    high: VectorLike,
+    num_centers: int | Sequence[int],
+    *,
+    bandwidth: VectorLike | None = None,
 ) -> tuple[Float[np.ndarray, "m s"], Float[np.ndarray, " s"]]:
     """Place the centres of radial basis functions.
 
@@ -164,8 +193,58 @@ def rbf_grid(
     Raises:
         ValueError: If `rbf_features` would refuse the settings.
     """
-    lows, highs, widths = _rbf_settings(low, high, num_centers, bandwidth)
-    return _centers(lows, highs, num_centers), widths
+    lows, highs, counts, widths = _rbf_settings(low, high, num_centers, bandwidth)
+    return _centers(lows, highs, counts), widths
+
+
+def describe(features: FeatureMap) -> dict[str, Any]:
+    """Describe features by plain values, from which `from_description` makes them again.
+
+    Raises:
+        ValueError: If they are a user's own and have no name.
+    """
+    for kind, functions in _KINDS.items():
+        if isinstance(features.apply, functions):
+            return {"kind": kind, **vars(features.apply)}
+    if features.name is None:
+        raise ValueError(
+            "features of your own must have a name to be saved, FeatureMap(..., name='mine'), "
+            f"got {checks.shown(features)}"
+        )
+    return {"kind": "own", "name": features.name, "size": features.size, "dim": features.context_dim}
+
+
+def from_description(description: Mapping[str, Any], own: FeatureMap | None = None) -> FeatureMap:
+    """Make the features that were described.
+
+    Args:
+        description: What `describe` returned.
+        own: The user's own features, where such were described.
+
+    Raises:
+        ValueError: If the description is none, or `own` is needed and missing or of another name or size.
+    """
+    settings = dict(description)
+    kind = settings.pop("kind", None)
+    if kind == "rbf":
+        width = settings.pop("width")
+        return rbf_features(settings["low"], settings["high"], settings["num_centers"], bandwidth=width)
+    if kind in _KINDS:
+        return {
+            "linear": linear_features,
+            "quadratic": quadratic_features,
+            "polynomial": polynomial_features,
+        }[kind](**settings)
+    if kind != "own":
+        raise ValueError(f"the kind of features must be one of {', '.join(_KINDS)}, got {kind!r}")
+    if own is None or (own.name, own.size, own.context_dim) != tuple(
+        settings[name] for name in ("name", "size", "dim")
+    ):
+        raise ValueError(
+            f"features must be the FeatureMap named {settings['name']!r}, of {settings['size']} features of "
+            f"{settings['dim']} context variables, got {checks.shown(own)}"
+        )
+    return own
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,7 +296,7 @@ class _Radial:
 
     low: tuple[float, ...]
     high: tuple[float, ...]
-    num_centers: int
+    num_centers: tuple[int, ...]
     width: tuple[float, ...]
 
     def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
@@ -252,10 +331,14 @@ class _Radial:
         return jax.nn.softmax(jnp.asarray(lax.optimization_barrier(-jnp.sum(costs, axis=1))))
 
 
-def _centers(low: np.ndarray, high: np.ndarray, num_centers: int) -> np.ndarray:
+_KINDS = {"linear": _Linear, "quadratic": _Quadratic, "polynomial": _Polynomial, "rbf": _Radial}
+"""What computes the features of each kind."""
+
+
+def _centers(low: np.ndarray, high: np.ndarray, num_centers: tuple[int, ...]) -> np.ndarray:
     """Return a row for each centre, in the order of the features."""
-    places = np.linspace(0.0, 1.0, num_centers) if num_centers > 1 else np.array([0.5])
-    grid = np.stack(np.meshgrid(*[places] * low.size, indexing="ij"), axis=-1).reshape(-1, low.size)
+    places = [np.linspace(0.0, 1.0, num) if num > 1 else np.array([0.5]) for num in num_centers]
+    grid = np.stack(np.meshgrid(*places, indexing="ij"), axis=-1).reshape(-1, low.size)
     return low + grid * (high - low)
 
 
@@ -266,18 +349,19 @@ def _kept_finite(features: Array) -> Array:
 
 
 def _rbf_settings(
-    low: VectorLike, high: VectorLike, num_centers: int, bandwidth: VectorLike | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return low, high and width of each context variable as arrays of one length, after checking them."""
+    low: VectorLike, high: VectorLike, num_centers: int | Sequence[int], bandwidth: VectorLike | None
+) -> tuple[np.ndarray, np.ndarray, tuple[int, ...], np.ndarray]:
+    """Return low, high, number of centres and width of each context variable, after checking them."""
     lows, highs = checks.ends(low, high)
-    checks.grid("num_centers", num_centers, lows.size)
-    widths = (highs - lows) / num_centers if bandwidth is None else checks.vector("bandwidth", bandwidth)
+    counts = checks.grid("num_centers", num_centers, lows.size)
+    default = (highs - lows) / np.array(counts)
+    widths = default if bandwidth is None else checks.vector("bandwidth", bandwidth)
     if widths.shape not in ((), (1,), lows.shape):
         raise ValueError(f"bandwidth must be a number or as long as low, {lows.size}, got {bandwidth}")
     if not np.all(widths >= checks.FLOAT32_TINY):
         note = ", which float32 cannot hold" if np.all(widths > 0) else ""
         raise ValueError(f"bandwidth must be above zero, got {bandwidth}{note}")
-    return lows, highs, np.broadcast_to(widths, lows.shape)
+    return lows, highs, counts, np.broadcast_to(widths, lows.shape)
 
 
 def _checked_context(context: Array, dim: int) -> Array:

@@ -1,7 +1,8 @@
-"""Keep a learned policy in a file that says all that is needed to use it."""
+"""Carry a learned policy away: a value that describes itself, and its file."""
 
 import dataclasses
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,229 +10,213 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from creps_jax.checks import shown
+from creps_jax import checks
 from creps_jax.errors import UserError
 from creps_jax.files import load_arrays, save_arrays
-from creps_jax.policies.features import FeatureMap, linear_features, rbf_features
+from creps_jax.policies import features as feature_maps
+from creps_jax.policies.feature_settings import Features
+from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.gaussian import LinearGaussian
-from creps_jax.policies.space import sigmoid_gate
-from creps_jax.typing import VectorLike
+from creps_jax.policies.space import Space
+from creps_jax.typing import Array, Float
+
+__all__ = ["Learned", "load", "save"]
 
 FORMAT = "creps_jax policy"
-VERSION = 2
-FEATURE_KINDS = ("linear", "rbf")
-CONSTRAINTS = ("none", "sigmoid", "penalty")
+VERSION = 3
+_READABLE = ("2", "3")
+_CLIP_BEFORE = "penalty"
+"""What files of version 2 call the constraint `clip`."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Features:
-    """Settings of the features of a policy.
-
-    Attributes:
-        kind: one of FEATURE_KINDS.
-        num_centers: K along each context variable, for RBFs.
-        bandwidth: width of the RBFs in context units; None is the default width.
-    """
-
-    kind: str = "rbf"
-    num_centers: int = 5
-    bandwidth: float | None = None
-
-    def make(self, low: VectorLike, high: VectorLike) -> FeatureMap:
-        """Return the features over a range of contexts: a number, or one for each context variable.
-
-        Raises:
-            UserError: if the kind is unknown.
-        """
-        if self.kind == "linear":
-            return linear_features(np.size(low))
-        if self.kind == "rbf":
-            return rbf_features(low, high, self.num_centers, bandwidth=self.bandwidth)
-        raise UserError(f"features must be one of {', '.join(FEATURE_KINDS)}, got {self.kind!r}")
-
-
-@dataclasses.dataclass(frozen=True)
-class SavedPolicy:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Learned:
     """A learned policy with all that is needed to use it.
 
+    `learned(0.3)` returns the parameters for the context 0.3, by name, in their units.
+
     Attributes:
-        coef: (p, d) mean is features @ coef.
-        cov_chol: (d, d) Cholesky factor of the covariance.
-        features: the features of the context.
-        context_names: what the s context variables are, with `context_units`, `context_low`, `context_high`.
-        param_names: what the d parameters are, with `param_units`, `param_low` and `param_high`.
-        constraint: how the bounds are held: one of CONSTRAINTS.
-        task: the name of the task, and the settings that it was learned with.
-    """
-
-    coef: np.ndarray
-    cov_chol: np.ndarray
-    features: Features
-    context_names: tuple[str, ...]
-    context_units: tuple[str, ...]
-    context_low: tuple[float, ...]
-    context_high: tuple[float, ...]
-    param_names: tuple[str, ...]
-    param_units: tuple[str, ...]
-    param_low: tuple[float, ...]
-    param_high: tuple[float, ...]
-    constraint: str
-    task: Mapping[str, Any]
-
-    @property
-    def policy(self) -> LinearGaussian:
-        """The policy as the library knows it."""
-        return LinearGaussian(jnp.asarray(self.coef), jnp.asarray(self.cov_chol))
-
-    def feature_map(self) -> FeatureMap:
-        """Return the features of the context."""
-        return self.features.make(self.context_low, self.context_high)
-
-    def mean(self, *context: float) -> np.ndarray:
-        """Return the policy's mean (d,) as it was learned, before any bounds are applied.
-
-        Args:
-            context: a number for each context variable.
-
-        Raises:
-            UserError: if there are more or fewer, or one is outside the range that was learned.
-        """
-        try:
-            numbers = tuple(float(value) for value in context)
-        except (TypeError, ValueError):
-            numbers = ()
-        if len(numbers) != len(self.context_names):
-            raise UserError(f"expected a number for each of {', '.join(self.context_names)}, got {context}")
-        for value, name, unit, low, high in zip(
-            numbers, self.context_names, self.context_units, self.context_low, self.context_high, strict=True
-        ):
-            # Ends that went through single precision belong to the range.
-            slack = 1e-6 * (high - low)
-            if not low - slack <= value <= high + slack:
-                raise UserError(
-                    f"{name} must be within the learned range, {low:g} to {high:g} {unit}, got {value}"
-                )
-        features = self.feature_map().apply(jnp.array(numbers, jnp.float32))
-        return np.asarray(features) @ np.asarray(self.coef)
-
-    def theta(self, *context: float) -> np.ndarray:
-        """Return the physical parameters (d,), within their bounds, for a context.
-
-        Args:
-            context: a number for each context variable.
-
-        Raises:
-            UserError: if there are more or fewer, or one is outside the range that was learned.
-        """
-        mean = self.mean(*context)
-        low, high = (np.asarray(bound, np.float32) for bound in (self.param_low, self.param_high))
-        if self.constraint == "sigmoid":
-            return np.asarray(sigmoid_gate(jnp.asarray(mean), jnp.asarray(low), jnp.asarray(high)))
-        return mean if self.constraint == "none" else np.clip(mean, low, high)
-
-
-def save_policy(path: Path | str, saved: SavedPolicy) -> None:
-    """Write a policy file, atomically.
+        policy: The distribution of free parameters, before bounds are applied.
+        features: The features of the context.
+        contexts: The context variables, with the ranges that the policy was learned for.
+        parameters: The parameters, with their bounds and how these are held.
+        task: What it was learned for: the name of the task, and the settings that it was learned with.
 
     Raises:
-        UserError: if the policy would not be accepted by `load_policy`, the path is no .npz file, or it
-            cannot be written.
+        ValueError: If the fields do not fit each other, or a number of the policy is not finite.
     """
-    path = _checked_path(path)
-    if path.suffix != ".npz":
-        raise UserError(f"a policy file must be named .npz, got {path}")
-    if not isinstance(saved, SavedPolicy):
-        raise UserError(f"saved must be a SavedPolicy, got {shown(saved)}")
-    _check(path, saved)
+
+    policy: LinearGaussian
+    features: FeatureMap
+    contexts: Space
+    parameters: Space
+    task: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check that the fields fit each other."""
+        for name, kind in (
+            ("policy", LinearGaussian),
+            ("features", FeatureMap),
+            ("contexts", Space),
+            ("parameters", Space),
+            ("task", Mapping),
+        ):
+            checks.instance(name, getattr(self, name), kind)
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                coef, cov_chol = (np.asarray(values, np.float32) for values in self.policy)
+        except (TypeError, ValueError):
+            raise ValueError(f"policy must be arrays of numbers, got {checks.shown(self.policy)}") from None
+        size = self.parameters.size
+        wanted = (self.features.size, size), (size, size)
+        if (coef.shape, cov_chol.shape) != wanted:
+            raise ValueError(
+                f"policy must have coef {wanted[0]} and cov_chol {wanted[1]}, "
+                f"got {coef.shape} and {cov_chol.shape}"
+            )
+        if not (np.isfinite(coef).all() and np.isfinite(cov_chol).all()):
+            raise ValueError("policy must be finite, got numbers that are not")
+        if self.features.context_dim != self.contexts.size:
+            raise ValueError(
+                f"features must be of the contexts {', '.join(self.contexts.names)}, "
+                f"got {self.features.context_dim} variables"
+            )
+        object.__setattr__(self, "policy", LinearGaussian(jnp.asarray(coef), jnp.asarray(cov_chol)))
+
+    def __call__(self, *context: Any) -> dict[str, float]:
+        """Return the parameters for a context, by name, in their units and within their bounds.
+
+        Args:
+            context: A number for each context variable.
+
+        Raises:
+            ValueError: If there are more or fewer, or one is outside the range that was learned; see
+                `in_range`.
+        """
+        return dict(zip(self.parameters.names, self.theta(*context).tolist(), strict=True))
+
+    def theta(self, *context: Any) -> np.ndarray:
+        """Return the parameters for a context as an array (d,), within their bounds.
+
+        Raises:
+            ValueError: As calling does.
+        """
+        return np.asarray(self.parameters.inside(jnp.asarray(self.mean(*context))))
+
+    def mean(self, *context: Any) -> np.ndarray:
+        """Return the mean of the free parameters (d,) for a context, before bounds are applied.
+
+        Raises:
+            ValueError: As calling does.
+        """
+        numbers = jnp.asarray(self.contexts.checked(context), jnp.float32)
+        return np.asarray(self.features.apply(numbers)) @ np.asarray(self.policy.coef)
+
+    def in_range(self, *context: Any) -> bool:
+        """Say whether a context is within the range that the policy was learned for.
+
+        Raises:
+            ValueError: If there is not a number for each context variable.
+        """
+        return self.contexts.contains(context)
+
+    def thetas(self, contexts: Float[Array, "n s"]) -> Float[Array, "n d"]:
+        """Return the parameters for many contexts; it can be jitted, and does not look at the range."""
+        return self.parameters.inside(jnp.asarray(self.features(contexts)) @ self.policy.coef)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a policy file, see `save`."""
+        save(path, self)
+
+
+def save(path: str | os.PathLike[str], learned: Learned) -> None:
+    """Write a policy file, atomically.
+
+    Args:
+        path: The file, .npz.
+        learned: The policy.
+
+    Raises:
+        ValueError: If its features are a user's own and have no name, the path is no .npz file, or it cannot
+            be written.
+    """
+    file = _checked_path(path)
+    if file.suffix != ".npz":
+        raise UserError(f"a policy file must be named .npz, got {file}")
+    checks.instance("learned", learned, Learned)
     arrays = {
         "format": FORMAT,
         "version": VERSION,
-        "coef": np.asarray(saved.coef, np.float32),
-        "cov_chol": np.asarray(saved.cov_chol, np.float32),
-        "features": json.dumps(dataclasses.asdict(saved.features)),
-        "context_names": np.array(saved.context_names),
-        "context_units": np.array(saved.context_units),
-        "context_range": np.array([saved.context_low, saved.context_high]),
-        "param_names": np.array(saved.param_names),
-        "param_units": np.array(saved.param_units),
-        "param_bounds": np.array([saved.param_low, saved.param_high]),
-        "constraint": saved.constraint,
-        "task": json.dumps(saved.task),
+        "coef": np.asarray(learned.policy.coef, np.float32),
+        "cov_chol": np.asarray(learned.policy.cov_chol, np.float32),
+        "features": json.dumps(feature_maps.describe(learned.features)),
+        "constraint": learned.parameters.constraint,
+        "task": json.dumps(dict(learned.task)),
     }
-    save_arrays(path, arrays)
+    for name, ends, space in (
+        ("context", "range", learned.contexts),
+        ("param", "bounds", learned.parameters),
+    ):
+        arrays[f"{name}_names"], arrays[f"{name}_units"] = np.array(space.names), np.array(space.units)
+        arrays[f"{name}_{ends}"] = np.array([space.low, space.high])
+    save_arrays(file, arrays)
 
 
-def load_policy(path: Path | str) -> SavedPolicy:
+def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) -> Learned:
     """Read a policy file.
 
+    Args:
+        path: The file.
+        features: Your own features, where the policy was learned with such.
+
     Raises:
-        UserError: if the file is missing, cut short, foreign, of another version, or holds what
-            no policy can hold (NaN, shapes that do not fit each other).
+        ValueError: If the file is missing, cut short, foreign, of another version, or holds what no policy
+            can hold (NaN, shapes that do not fit each other), or your own features are needed.
     """
-    path = _checked_path(path)
-    arrays = load_arrays(path)
+    file = _checked_path(path)
+    arrays = load_arrays(file)
     if str(arrays.get("format")) != FORMAT:
-        raise UserError(f"{path} is no policy file (its format is not {FORMAT!r})")
-    if str(arrays.get("version")) != str(VERSION):
-        raise UserError(f"{path} is a policy file of version {arrays.get('version')}, expected {VERSION}")
+        raise UserError(f"{file} is no policy file (its format is not {FORMAT!r})")
+    if str(arrays.get("version")) not in _READABLE:
+        expected = " or ".join(_READABLE)
+        raise UserError(f"{file} is a policy file of version {arrays.get('version')}, expected {expected}")
     try:
         context_low, context_high = arrays["context_range"].tolist()
         param_low, param_high = arrays["param_bounds"].tolist()
-        saved = SavedPolicy(
-            coef=arrays["coef"],
-            cov_chol=arrays["cov_chol"],
-            features=Features(**json.loads(str(arrays["features"]))),
-            context_names=tuple(arrays["context_names"].tolist()),
-            context_units=tuple(arrays["context_units"].tolist()),
-            context_low=tuple(context_low),
-            context_high=tuple(context_high),
-            param_names=tuple(arrays["param_names"].tolist()),
-            param_units=tuple(arrays["param_units"].tolist()),
-            param_low=tuple(param_low),
-            param_high=tuple(param_high),
-            constraint=str(arrays["constraint"]),
-            task=json.loads(str(arrays["task"])),
+        constraint = str(arrays["constraint"])
+        constraint = "clip" if constraint == _CLIP_BEFORE else constraint
+        return Learned(
+            LinearGaussian(jnp.asarray(arrays["coef"]), jnp.asarray(arrays["cov_chol"])),
+            _features(json.loads(str(arrays["features"])), (context_low, context_high), features),
+            _space(arrays, "context", context_low, context_high, "none"),
+            _space(arrays, "param", param_low, param_high, constraint),
+            json.loads(str(arrays["task"])),
         )
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path} is an incomplete policy file: {error}") from error
-    _check(path, saved)
-    return saved
+    except KeyError as error:
+        raise UserError(f"{file} is an incomplete policy file: it has no {error}") from error
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{file}: {error}") from error
 
 
-def _checked_path(path: Path | str) -> Path:
-    if not isinstance(path, Path | str):
-        raise UserError(f"path must be that of a file, got {shown(path)}")
+def _space(
+    arrays: Mapping[str, np.ndarray], name: str, low: list[float], high: list[float], constraint: str
+) -> Space:
+    names, units = (tuple(arrays[f"{name}_{field}"].tolist()) for field in ("names", "units"))
+    return Space(names, tuple(low), tuple(high), units, constraint)
+
+
+def _features(
+    description: dict[str, Any], context_range: tuple[list[float], list[float]], own: FeatureMap | None
+) -> FeatureMap:
+    """Make the features of a file; those of version 2 are over the range of the contexts."""
+    if description.get("kind") == "rbf" and "low" not in description:
+        return Features(**description).make(*context_range)
+    if description.get("kind") == "linear" and "dim" not in description:
+        return Features("linear").make(*context_range)
+    return feature_maps.from_description(description, own)
+
+
+def _checked_path(path: str | os.PathLike[str]) -> Path:
+    if not isinstance(path, str | os.PathLike):
+        raise UserError(f"path must be that of a file, got {checks.shown(path)}")
     return Path(path)
-
-
-def _check(path: Path, saved: SavedPolicy) -> None:
-    """Refuse what cannot be a policy."""
-    if saved.constraint not in CONSTRAINTS:
-        raise UserError(
-            f"{path}: constraint must be one of {', '.join(CONSTRAINTS)}, got {saved.constraint!r}"
-        )
-    numbers = [saved.coef, saved.cov_chol, saved.param_low, saved.param_high]
-    numbers += [saved.context_low, saved.context_high]
-    try:
-        is_finite = all(np.all(np.isfinite(values)) for values in numbers)
-    except TypeError:
-        raise UserError(f"{path}: the policy holds something else where numbers are expected") from None
-    if not is_finite:
-        raise UserError(f"{path}: the policy holds numbers that are not finite")
-    if not len(saved.context_names) == len(saved.context_units) == len(saved.context_low):
-        raise UserError(f"{path}: expected a unit and a range for each of {', '.join(saved.context_names)}")
-    num_params = len(saved.param_names)
-    try:
-        wanted = (saved.feature_map().size, num_params)
-    except ValueError as error:
-        raise UserError(f"{path}: {error}") from error
-    if np.shape(saved.coef) != wanted or np.shape(saved.cov_chol) != (num_params, num_params):
-        raise UserError(
-            f"{path}: expected coef {wanted} and cov_chol {(num_params, num_params)}, "
-            f"got {np.shape(saved.coef)} and {np.shape(saved.cov_chol)}"
-        )
-    if not len(saved.param_units) == len(saved.param_low) == len(saved.param_high) == num_params:
-        raise UserError(f"{path}: expected units and bounds for each of the {num_params} parameters")
-    for name, low, high in zip(saved.param_names, saved.param_low, saved.param_high, strict=True):
-        if low > high:
-            raise UserError(f"{path}: the bounds of {name} must be in order, got {low} and {high}")

@@ -1,6 +1,9 @@
-"""Keep parameters inside a box: by squashing them into it, or by a price for leaving it."""
+"""Describe contexts and parameters, and keep parameters inside their bounds."""
 
+import dataclasses
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +11,146 @@ import numpy as np
 from jax.core import Tracer
 
 from creps_jax import checks
+from creps_jax.errors import UserError
 from creps_jax.typing import Array, Float, ScalarLike, VectorLike
 
-__all__ = ["penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
+__all__ = ["CONSTRAINTS", "Space", "penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
+
+CONSTRAINTS = ("sigmoid", "clip", "none")
+"""How numbers that a search draws freely become parameters inside their bounds: squashed by a sigmoid, cut
+off at the bounds, or not at all."""
 
 _WIDE = 1e37
 """Width of a box from which it, or its inverse, can be out of the range of float32."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Space:
+    """The variables of a context, or of a parameter vector: names, units and ranges.
+
+    Attributes:
+        names: A name for each of the n variables.
+        low: Lower ends; minus infinity where there is none.
+        high: Upper ends.
+        units: Units, by default none.
+        constraint: Of parameters, how free numbers are kept inside: one of `CONSTRAINTS`.
+
+    Raises:
+        ValueError: If names are missing or equal, there is not one end and unit for each, an end is no
+            number, a lower one is above the upper one, or a sigmoid has no finite ends.
+    """
+
+    names: tuple[str, ...]
+    low: tuple[float | int, ...]
+    high: tuple[float | int, ...]
+    units: tuple[str, ...] = ()
+    constraint: str = "none"
+
+    def __post_init__(self) -> None:
+        """Check the fields, and turn sequences into tuples."""
+        names = (self.names,) if isinstance(self.names, str) else tuple(self.names)
+        units = (self.units,) if isinstance(self.units, str) else tuple(self.units)
+        low, high = (self._ends(side, len(names)) for side in ("low", "high"))
+        for field, values in (("names", names), ("units", units or ("",) * len(names))):
+            if not all(isinstance(value, str) for value in values):
+                raise ValueError(f"{field} must be texts, got {checks.shown(values)}")
+            object.__setattr__(self, field, values)
+        if not names or len(set(names)) < len(names) or not all(name.strip() for name in names):
+            raise ValueError(f"names must be different names, at least one, got {names}")
+        if len(self.units) != len(names):
+            raise ValueError(f"units must be one for each of {', '.join(names)}, got {self.units}")
+        for name, bottom, top in zip(names, low, high, strict=True):
+            if not bottom <= top:
+                raise ValueError(f"low of {name} must not exceed its high, got {bottom:g} and {top:g}")
+        object.__setattr__(self, "low", low)
+        object.__setattr__(self, "high", high)
+        if self.constraint not in CONSTRAINTS:
+            raise ValueError(f"constraint must be one of {', '.join(CONSTRAINTS)}, got {self.constraint!r}")
+        if self.constraint == "sigmoid" and not all(map(math.isfinite, (*low, *high))):
+            raise ValueError(f"low and high must be finite for a sigmoid, got {low} and {high}")
+
+    @classmethod
+    def unnamed(cls, name: str, size: int) -> "Space":
+        """Return the space of so many variables of which nothing is known: `name_0`, `name_1` and so on."""
+        return cls(tuple(f"{name}_{i}" for i in range(size)), (-math.inf,) * size, (math.inf,) * size)
+
+    @property
+    def size(self) -> int:
+        """The number of variables."""
+        return len(self.names)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Each name with its unit, such as `speed (m/s)`."""
+        pairs = zip(self.names, self.units, strict=True)
+        return tuple(f"{name} ({unit})" if unit else name for name, unit in pairs)
+
+    def inside(self, free: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
+        """Turn numbers that a search draws freely into parameters inside the bounds.
+
+        Source: Abdolmaleki et al. 2016, Eq. 17, for a sigmoid.
+        """
+        if self.constraint == "sigmoid":
+            return sigmoid_gate(free, self.low, self.high)
+        if self.constraint == "clip":
+            low, high = (jnp.asarray(end, free.dtype) for end in (self.low, self.high))
+            return jnp.clip(free, low, high)
+        return free
+
+    def numbers(self, values: Sequence[Any]) -> np.ndarray:
+        """Return a number for each variable as an array (n,).
+
+        Raises:
+            ValueError: If there are more or fewer, or one is no number.
+        """
+        try:
+            numbers = np.array([float(value) for value in values])
+        except (TypeError, ValueError):
+            numbers = np.zeros(0)
+        if len(numbers) != self.size:
+            given = (
+                ", ".join(map(checks.shown, values)) if isinstance(values, tuple) else checks.shown(values)
+            )
+            raise UserError(f"values must be a number for each of {', '.join(self.names)}, got {given}")
+        return numbers
+
+    def contains(self, values: Sequence[Any]) -> bool:
+        """Say whether each number is within its range; ends that went through single precision are."""
+        return self._outside(self.numbers(values)) is None
+
+    def checked(self, values: Sequence[Any]) -> np.ndarray:
+        """Return numbers (n,) after checking that they are within the ranges.
+
+        Raises:
+            ValueError: If there are more or fewer, or one is no number or out of its range.
+        """
+        numbers = self.numbers(values)
+        found = self._outside(numbers)
+        if found is not None:
+            low, high, unit = self.low[found], self.high[found], self.units[found]
+            raise UserError(
+                f"{self.names[found]} must be within the learned range, {low:g} to {high:g} {unit}, "
+                f"got {numbers[found]}".replace(" ,", ",")
+            )
+        return numbers
+
+    def _outside(self, numbers: np.ndarray) -> int | None:
+        """Return the first variable that is out of its range."""
+        for index, (value, low, high) in enumerate(zip(numbers, self.low, self.high, strict=True)):
+            slack = 1e-6 * (high - low) if math.isfinite(high - low) else 0.0
+            if not (low - slack <= value <= high + slack and math.isfinite(value)):
+                return index
+        return None
+
+    def _ends(self, side: str, num: int) -> tuple[float, ...]:
+        values = np.ravel(np.asarray(getattr(self, side), object)).tolist()
+        try:
+            ends = tuple(float(value) for value in values)
+        except (TypeError, ValueError):
+            ends = ()
+        if len(ends) != num or any(map(math.isnan, ends)):
+            raise ValueError(f"{side} must be {num} numbers, one for each name, got {getattr(self, side)}")
+        return ends
 
 
 def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) -> Float[Array, "*b d"]:

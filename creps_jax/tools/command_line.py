@@ -4,6 +4,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Never
 
 from creps_jax.errors import UserError
@@ -25,8 +26,22 @@ def answer(command: Callable[[], int]) -> int:
     except (UserError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except ValueError as error:
+        # What the library refuses, such as a setting out of its range, is a mistake; anything else is a bug.
+        if not _is_refused_by_the_library(error):
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+def _is_refused_by_the_library(error: ValueError) -> bool:
+    traceback = error.__traceback__
+    while traceback is not None and traceback.tb_next is not None:
+        traceback = traceback.tb_next
+    library = Path(__file__).parents[1]
+    return traceback is not None and Path(traceback.tb_frame.f_code.co_filename).is_relative_to(library)
 
 
 def check_seed(seed: int | None) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from creps_jax import files
 from creps_jax.errors import UserError
 from creps_jax.files import policies_folder
-from creps_jax.policies.learned import SavedPolicy, load_policy
+from creps_jax.policies.learned import Learned, load
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.simulation import c
 from creps_jax.tasks.conditions import slope
@@ -62,7 +62,8 @@ def show(
     thetas = [policy.theta(speed) for speed in speeds]
     say(f"policy: {path}")
     if len(thetas) == 1:
-        for name, unit, value in zip(policy.param_names, policy.param_units, thetas[0], strict=True):
+        space = policy.parameters
+        for name, unit, value in zip(space.names, space.units, thetas[0], strict=True):
             say(f"  {name.replace('_', ' '):16}{value:8.4f} {unit}".rstrip())
     clips = record(policy, speeds, seed=seed)
     for clip in clips:
@@ -70,14 +71,14 @@ def show(
     save_film(clips, out, say, robot=robot_of(policy))
 
 
-def filmed_speeds(policy: SavedPolicy) -> list[float]:
+def filmed_speeds(policy: Learned) -> list[float]:
     """Return six speeds over the range of a policy, m/s."""
-    speeds = np.linspace(policy.context_low[0], policy.context_high[0], _FILMED)
+    speeds = np.linspace(policy.contexts.low[0], policy.contexts.high[0], _FILMED)
     return [round(float(speed), 6) for speed in speeds]
 
 
 def record(
-    policy: SavedPolicy,
+    policy: Learned,
     speeds: Sequence[float],
     *,
     seed: int,
@@ -106,7 +107,7 @@ def record(
     settings = {"duration": duration, "balance": balance_of(policy), "physics": c.make_control_step}
     settings["robot"] = robot_of(policy)
     if slopes is not None:
-        settings["conditions"] = (slope(policy.context_low[1], policy.context_high[1]),)
+        settings["conditions"] = (slope(policy.contexts.low[1], policy.contexts.high[1]),)
     walk = jax.jit(jax.vmap(lambda key, theta, way: record_walk(key, theta, values=way, **settings)))
     keys = jax.random.split(jax.random.key(seed), len(speeds))
     walks = walk(keys, thetas, jnp.asarray(ways, jnp.float32))
@@ -164,7 +165,7 @@ def shipped_policy(robot: str | None = None) -> Path:
     return shipped[-1]
 
 
-def load_walking_policy(path: Path, robot: str | None = None) -> SavedPolicy:
+def load_walking_policy(path: Path, robot: str | None = None) -> Learned:
     """Read a policy file and see that it is one of walking.
 
     Args:
@@ -174,9 +175,10 @@ def load_walking_policy(path: Path, robot: str | None = None) -> SavedPolicy:
     Raises:
         UserError: if it is not, or is unreadable, or of an unknown robot.
     """
-    policy = load_policy(path)
-    if policy.param_names != PARAM_NAMES:
-        raise UserError(f"{path} is no walking policy: its parameters are {', '.join(policy.param_names)}")
+    policy = load(path)
+    if policy.parameters.names != PARAM_NAMES:
+        found = ", ".join(policy.parameters.names)
+        raise UserError(f"{path} is no walking policy: its parameters are {found}")
     try:
         is_finite = all(math.isfinite(gain) for gain in balance_of(policy))  # type: ignore[arg-type]
     except (KeyError, TypeError):
@@ -195,7 +197,7 @@ def load_walking_policy(path: Path, robot: str | None = None) -> SavedPolicy:
     return policy
 
 
-def robot_of(policy: SavedPolicy) -> Robot:
+def robot_of(policy: Learned) -> Robot:
     """Return the robot that a policy was learned with: the NAO where the file, an older one, does not say.
 
     Raises:
@@ -204,6 +206,6 @@ def robot_of(policy: SavedPolicy) -> Robot:
     return find_walker(str(policy.task.get("robot", NAO.name))).robot
 
 
-def balance_of(policy: SavedPolicy) -> Balance:
+def balance_of(policy: Learned) -> Balance:
     """Return how the steps of a policy answered to the measured orientation while it was learned."""
     return Balance(**policy.task["balance"])

@@ -6,13 +6,13 @@ import datetime
 import importlib.metadata
 import platform
 import subprocess
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from creps_jax import files
 from creps_jax.errors import UserError
+from creps_jax.files import package_version
 from creps_jax.tools.process import usable_cores
 
 ARRAYS = "arrays.npz"
@@ -81,7 +81,7 @@ def make_manifest(experiment: str, preset: str, settings: Any, seed: int) -> dic
         "started": datetime.datetime.now().astimezone().isoformat(timespec="milliseconds"),
         "seconds": 0.0,
         "commit": git_commit(),
-        "version": project_version(),
+        "version": package_version(),
         "python": platform.python_version(),
         "packages": package_versions(),
         "system": platform.platform(),
@@ -125,15 +125,6 @@ def git_commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return described.stdout.strip() or None
-
-
-def project_version() -> str:
-    """Return the version of creps_jax, installed or not."""
-    with contextlib.suppress(importlib.metadata.PackageNotFoundError):
-        return importlib.metadata.version("creps_jax")
-    with contextlib.suppress(OSError, KeyError, tomllib.TOMLDecodeError):
-        return tomllib.loads((_CHECKOUT / "pyproject.toml").read_text())["project"]["version"]
-    return "unknown"
 
 
 def package_versions() -> dict[str, str]:

@@ -22,7 +22,7 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 
 from creps_jax.errors import UserError  # noqa: E402
-from creps_jax.policies.learned import SavedPolicy  # noqa: E402
+from creps_jax.policies.learned import Learned  # noqa: E402
 from creps_jax.tasks import Task  # noqa: E402
 from creps_jax.tasks.walking import WalkNoise, nao_walk  # noqa: E402
 from creps_jax.tools import tables  # noqa: E402
@@ -61,12 +61,12 @@ def main(
     print(f"mean reward {outcome.reward.mean():.4f}, falls {int(outcome.fell.sum())} of {outcome.fell.size}")
 
 
-def speeds_of(saved: SavedPolicy) -> np.ndarray:
+def speeds_of(saved: Learned) -> np.ndarray:
     """Return 11 speeds over the range of a policy, m/s: for the NAO the paper's."""
-    return np.linspace(saved.context_low[0], saved.context_high[0], NUM_SPEEDS, dtype=np.float32)
+    return np.linspace(saved.contexts.low[0], saved.contexts.high[0], NUM_SPEEDS, dtype=np.float32)
 
 
-def walk_at_all_speeds(saved: SavedPolicy, task: Task, *, seed: int) -> Any:
+def walk_at_all_speeds(saved: Learned, task: Task, *, seed: int) -> Any:
     """Roll out a policy at 11 speeds with fresh noise; the outcome has axes (speeds, seeds)."""
     speeds = speeds_of(saved)
     thetas = jnp.stack([jnp.asarray(saved.theta(float(speed))) for speed in speeds])

@@ -135,8 +135,8 @@ def folder(tiny):
         Path(name).mkdir()
     Path("full/notes.txt").write_text("mine")
     quick = walk.SETTINGS["quick"]
-    policy = walk.saved_policy(quick, walk.first_policy(quick))
-    walk.save_policy(Path("whole.npz"), policy)
+    policy = walk.as_learned(quick, walk.first_policy(quick))
+    policy.save(Path("whole.npz"))
     Path("cut.npz").write_bytes(Path("whole.npz").read_bytes()[:-100])
     arrays = files.load_arrays(Path("whole.npz"))
     files.save_arrays(Path("nan.npz"), {**arrays, "coef": arrays["coef"] * float("nan")})

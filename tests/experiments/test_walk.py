@@ -12,7 +12,7 @@ import pytest
 
 from creps_jax import files
 from creps_jax.errors import UserError
-from creps_jax.policies.learned import load_policy
+from creps_jax.policies.learned import load
 from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.simulation import c
 from creps_jax.tasks.base import Task
@@ -32,7 +32,6 @@ from creps_jax.walking.params import (
 )
 from creps_jax.walking.posture import Balance
 from experiments import fig11_walk, runner, walk
-from experiments.cli import main
 
 SHIPPED = shipped_policy()
 
@@ -66,10 +65,10 @@ def bench(tmp_path, monkeypatch):
 
 
 def test_the_result_folder_is_complete(bench):
-    folder = runner.run(runner.Request("walk"), console=None, say=lambda _: None)
-    files = "arrays.npz manifest.json checkpoint-walk.npz claims.md policy.npz table.csv table.md"
+    folder = runner.run(runner.Request("walk", walk.SETTINGS["quick"]), console=None, say=lambda _: None)
+    names = "arrays.npz manifest.json checkpoint-walk.npz claims.md policy.npz table.csv table.md"
     figures = "learning_curve.png parameters.png speed.png updates.png"
-    assert {path.name for path in folder.iterdir()} == {*files.split(), *figures.split()}
+    assert {path.name for path in folder.iterdir()} == {*names.split(), *figures.split()}
     assert bench == [folder / "walk.mp4"]
     arrays = files.load_arrays(folder / "arrays.npz")
     assert arrays["reward"].shape == (2, 11, 3)
@@ -79,7 +78,7 @@ def test_the_result_folder_is_complete(bench):
     assert arrays["trial_reward"].shape == (2,)
 
     # The file's policy does what was evaluated, and the table says so.
-    policy, trial = load_policy(folder / "policy.npz"), walk.chosen_trial(arrays)
+    policy, trial = load(folder / "policy.npz"), walk.chosen_trial(arrays)
     reached = [policy.theta(float(speed))[7] / policy.theta(float(speed))[3] for speed in arrays["speeds"]]
     np.testing.assert_allclose(arrays["speed"][trial, :, 0, 0], reached, rtol=1e-4)
     with (folder / "table.csv").open() as file:
@@ -161,16 +160,16 @@ def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
     for match, arguments in (
         ("no policy has been learned yet", ["play", "--speed", "0.3"]),
         ("yet: python -m experiments run walk --robot nao_h25 --", ["play", "--robot", "nao_h25"]),
-        ("unknown robot 'nao_h26', did you mean 'nao_h25'?", ["run", "walk", "--robot", "nao_h26"]),
+        ("unknown robot 'nao_h26', did you mean 'nao_h25'?", ["play", "--robot", "nao_h26"]),
         ("cannot read bad.npz", ["play", "--speed", "0.3", "--policy", "bad.npz"]),
         ("no such file: none.npz", ["play", "--policy", "none.npz"]),
     ):
-        assert (main if arguments[0] == "run" else tools)(arguments) == 2
+        assert tools(arguments) == 2
         error = capsys.readouterr().err
         assert match in error
         assert len(error.splitlines()) == 1
     settings = walk.SETTINGS["quick"]
-    walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
+    walk.as_learned(settings, walk.first_policy(settings)).save(Path("p.npz"))
     assert tools(["play", "--speed", "0.9", "--policy", "p.npz"]) == 2
     assert "within the learned range, 0.1 to 0.6 m/s, got 0.9" in capsys.readouterr().err
     assert tools(["play", "--speed", "0.5", "--policy", "p.npz"]) == 0
@@ -179,10 +178,10 @@ def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
 @pytest.mark.parametrize("task", [{"heading_gain": 0.3}, {"balance": {"ankle": 1.0}}, {"balance": None}])
 def test_a_policy_that_was_balanced_otherwise_is_refused(tmp_path, task):
     settings = walk.SETTINGS["quick"]
-    saved = walk.saved_policy(settings, walk.first_policy(settings))
-    walk.save_policy(tmp_path / "p.npz", saved)
+    saved = walk.as_learned(settings, walk.first_policy(settings))
+    saved.save(tmp_path / "p.npz")
     assert balance_of(load_walking_policy(tmp_path / "p.npz")) == Balance(0.3, 0.6) == settings.balance()
-    walk.save_policy(tmp_path / "p.npz", dataclasses.replace(saved, task=task))
+    dataclasses.replace(saved, task=task).save(tmp_path / "p.npz")
     with pytest.raises(UserError, match=r"p.npz does not say how its steps were balanced: expected heading"):
         load_walking_policy(tmp_path / "p.npz")
 
@@ -193,7 +192,7 @@ def test_a_machine_without_opengl_only_lacks_the_video(bench, monkeypatch):
 
     monkeypatch.setattr(play, "write_video", fail)
     settings, said = walk.SETTINGS["quick"], []
-    walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
+    walk.as_learned(settings, walk.first_policy(settings)).save(Path("p.npz"))
     play.show([0.3], Path("p.npz"), out=Path("walk.mp4"), seed=0, say=said.append)
     assert said[-2].startswith("asked 0.30")
     assert "apt-get" in said[-1]
@@ -202,7 +201,7 @@ def test_a_machine_without_opengl_only_lacks_the_video(bench, monkeypatch):
 @pytest.mark.parametrize("kind", ["linear", "rbf"])
 def test_the_first_policy_is_the_same_for_every_speed(kind):
     settings = walk.Settings(features=walk.Features(kind), start_mean=-0.5, low=0.1, high=0.6)
-    policy = walk.saved_policy(settings, walk.first_policy(settings))
+    policy = walk.as_learned(settings, walk.first_policy(settings))
     for speed in (0.1, 0.25, 0.6):
         np.testing.assert_allclose(policy.mean(speed), np.full(10, -0.5), rtol=1e-5)
 
@@ -230,15 +229,13 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
     np.testing.assert_allclose(settings.speeds()[[0, -1]], [low, high], rtol=1e-6)
     assert not tables.are_the_papers(settings.speeds())
 
-    saved = walk.saved_policy(settings, walk.first_policy(settings))
-    walk.save_policy(tmp_path / "p.npz", saved)
+    saved = walk.as_learned(settings, walk.first_policy(settings))
+    saved.save(tmp_path / "p.npz")
     assert robot_of(load_walking_policy(tmp_path / "p.npz")) is NAO_H25
     # Files from before there was a choice are the NAO's.
-    walk.save_policy(
-        tmp_path / "old.npz", dataclasses.replace(saved, task={"balance": saved.task["balance"]})
-    )
+    dataclasses.replace(saved, task={"balance": saved.task["balance"]}).save(tmp_path / "old.npz")
     assert robot_of(load_walking_policy(tmp_path / "old.npz", "nao")) is NAO
-    walk.save_policy(tmp_path / "odd.npz", dataclasses.replace(saved, task={**saved.task, "robot": "pepper"}))
+    dataclasses.replace(saved, task={**saved.task, "robot": "pepper"}).save(tmp_path / "odd.npz")
     with pytest.raises(UserError, match=r"odd\.npz: unknown robot 'pepper', choose from: nao, nao_h25"):
         load_walking_policy(tmp_path / "odd.npz")
 
@@ -250,7 +247,7 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
 )
 def test_a_policy_of_another_robot_is_refused(bench, capsys, command):
     settings = walk.SETTINGS["quick"]
-    walk.save_policy(Path("p.npz"), walk.saved_policy(settings, walk.first_policy(settings)))
+    walk.as_learned(settings, walk.first_policy(settings)).save(Path("p.npz"))
     assert tools([*command, "--policy", "p.npz", "--robot", "nao_h25"]) == 2
     assert capsys.readouterr().err == "error: p.npz is a policy of the robot nao, not of nao_h25\n"
     assert not Path("w.csv").exists() and not bench
@@ -259,8 +256,8 @@ def test_a_policy_of_another_robot_is_refused(bench, capsys, command):
 def test_each_robot_has_its_latest_run(bench):
     shipped = play.default_policy("nao_h25")
     assert shipped == shipped_policy("nao_h25") != play.default_policy()
-    request = runner.Request("walk", overrides={"robot": "nao_h25"})
-    folder = runner.run(request, console=None, say=lambda _: None)
+    settings = dataclasses.replace(walk.SETTINGS["quick"], robot="nao_h25")
+    folder = runner.run(runner.Request("walk", settings), console=None, say=lambda _: None)
     assert play.default_policy("nao_h25") == folder / "policy.npz"
     assert play.default_policy() == play.default_policy("nao") == SHIPPED
     kept = results.load_manifest(folder)["settings"]
@@ -334,13 +331,12 @@ def test_resume_finds_the_latest_unfinished_run_of_the_robot(bench):
     others = unfinished("1", settings["nao_h25"])
     ours = unfinished("2", settings["nao"])
     for robot, folder in ((None, ours), ("nao", ours), ("nao_h25", others)):
-        overrides = {} if robot is None else {"robot": robot}
-        request = runner.Request("walk", overrides=overrides, resume=True)
-        resumed, found, _ = runner._resumed(walk, request)
-        assert found == folder and resumed.robot == (robot or "nao")
+        found = runner.folder_to_resume("walk", None, robot)
+        assert found == folder
+        assert runner.default_settings(walk, "walk", out=found, resume=True).robot == (robot or "nao")
     shutil.rmtree(others)
     with pytest.raises(UserError, match="no unfinished run of walk with the robot nao_h25 in results"):
-        runner._resumed(walk, runner.Request("walk", overrides={"robot": "nao_h25"}, resume=True))
+        runner.folder_to_resume("walk", None, "nao_h25")
 
 
 @pytest.mark.parametrize("physics", ["mjx", "auto"])
@@ -349,7 +345,8 @@ def test_a_run_from_before_robots_can_be_resumed(bench, physics):
     settings = dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"].resolved(), physics=physics))
     del settings["robot"]
     unfinished("1", settings)
-    resumed, _, manifest = runner._resumed(walk, runner.Request("walk", resume=True))
+    begin = runner.default_settings(walk, "walk", resume=True)
+    resumed, _, manifest = runner._resumed(walk, runner.Request("walk", begin, resume=True))
     del settings["iterations"]
     assert runner._identity("walk", resumed, manifest["seed"])["settings"] == settings
     assert resumed.physics == physics and resumed.robot == "nao"
@@ -359,7 +356,7 @@ def test_a_run_from_before_robots_can_be_resumed(bench, physics):
 @pytest.mark.usefixtures("relaxed_promotion")
 def test_the_shipped_policy_walks_at_the_asked_speed(robot):
     policy = load_walking_policy(shipped_policy(robot), robot)
-    (low,), (high,) = policy.context_low, policy.context_high
+    (low,), (high,) = policy.contexts.low, policy.contexts.high
     assert (low, high) == (WALKERS[robot].low, WALKERS[robot].high)
     speeds = low + jnp.array([[0.0], [0.3], [0.7], [1.0]]) * (high - low)
     thetas = jnp.stack([jnp.asarray(policy.theta(float(speed))) for (speed,) in speeds])

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from creps_jax import files
 from creps_jax.errors import UserError
 from creps_jax.files import policies_folder
-from creps_jax.policies.learned import load_policy
+from creps_jax.policies.learned import load
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.walking import WalkOutcome, WalkRecord
 from creps_jax.tools import play
@@ -52,10 +53,12 @@ def settings(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("simple_updates")
 def test_the_result_folder_is_complete(settings):
     said = []
-    folder = runner.run(runner.Request("walk_slope"), console=None, say=said.append)
-    files = "arrays.npz manifest.json checkpoint-walk_slope.npz claims.md policy.npz table.md"
+    folder = runner.run(
+        runner.Request("walk_slope", walk_slope.SETTINGS["quick"]), console=None, say=said.append
+    )
+    names = "arrays.npz manifest.json checkpoint-walk_slope.npz claims.md policy.npz table.md"
     figures = "learning_curve.png updates.png falls.png speed.png parameters.png"
-    assert {path.name for path in folder.iterdir()} == {*files.split(), *figures.split()}
+    assert {path.name for path in folder.iterdir()} == {*names.split(), *figures.split()}
     arrays = files.load_arrays(folder / "arrays.npz")
     speeds, slopes = arrays["speeds"], arrays["slopes"]
     np.testing.assert_allclose(speeds, [0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4], rtol=1e-6)
@@ -63,8 +66,8 @@ def test_the_result_folder_is_complete(settings):
     assert arrays["fell"].shape == (2, 7, 9, 3)
 
     # Numbers lie at the speed and the slope that they are of, and the file's policy is the one evaluated.
-    policy, trial = load_policy(folder / "policy.npz"), walk.chosen_trial(arrays)
-    assert policy.context_names == ("speed", "slope") and policy.context_units == ("m/s", "deg")
+    policy, trial = load(folder / "policy.npz"), walk.chosen_trial(arrays)
+    assert policy.contexts.names == ("speed", "slope") and policy.contexts.units == ("m/s", "deg")
     for i, j in ((0, 0), (2, 7), (6, 3)):
         theta = policy.theta(float(speeds[i]), float(slopes[j]))
         np.testing.assert_allclose(arrays["theta"][trial, i, j], theta, rtol=1e-4, atol=1e-6)
@@ -87,9 +90,9 @@ def test_contexts_are_drawn_a_little_beyond_both_ranges(settings):
 
 
 def test_learning_begins_with_the_shipped_walk_on_every_slope(settings):
-    start = walk.saved_policy(settings, walk_slope.warm_start(settings))
-    shipped = load_policy(policies_folder() / "walk.npz")
-    width = np.subtract(shipped.param_high, shipped.param_low)
+    start = walk.as_learned(settings, walk_slope.warm_start(settings))
+    shipped = load(policies_folder() / "walk.npz")
+    width = np.subtract(shipped.parameters.high, shipped.parameters.low)
     for speed in (0.1, 0.22, 0.4):
         for degrees in (-10.0, 1.0, 10.0):
             np.testing.assert_array_less(
@@ -110,7 +113,7 @@ def test_films_show_each_walk_on_its_slope(settings, monkeypatch):
         qpos = jnp.zeros((len(time), 29)).at[:, 0].set(0.1 * values[0] * time)
         return WalkRecord(time, qpos, qpos, qpos, jnp.zeros(len(time), bool))
 
-    policy = walk.saved_policy(settings, walk.first_policy(settings))
+    policy = walk.as_learned(settings, walk.first_policy(settings))
     monkeypatch.setattr(play, "record_walk", recorded)
     clips = play.record(policy, (0.2, 0.3), seed=0, slopes=(2.0, -4.0))
     assert [clip.slope for clip in clips] == [2.0, -4.0]

@@ -1,148 +1,220 @@
 import dataclasses
+import json
+from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import creps_jax as cj
 from creps_jax import files
 from creps_jax.errors import UserError
-from creps_jax.policies.learned import Features, SavedPolicy, load_policy, save_policy
+from creps_jax.policies import features as feature_maps
+from creps_jax.policies.features import (
+    FeatureMap,
+    linear_features,
+    polynomial_features,
+    quadratic_features,
+    rbf_features,
+)
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.learned import Learned, load, save
+from creps_jax.policies.space import Space
+
+SPEED = Space(("speed",), (0.1,), (0.6,), ("m/s",))
+WALK = Space(("a", "b"), (0.0, -1.0), (2.0, 1.0), ("m", ""), "sigmoid")
+RBF = rbf_features(0.1, 0.6, 4)
 
 
-def make_policy(**changes) -> SavedPolicy:
-    rng = np.random.default_rng(0)
-    policy = SavedPolicy(
-        coef=rng.normal(size=(4, 2)).astype(np.float32),
-        cov_chol=np.eye(2, dtype=np.float32),
-        features=Features("rbf", 4),
-        context_names=("speed",),
-        context_units=("m/s",),
-        context_low=(0.1,),
-        context_high=(0.6,),
-        param_names=("a", "b"),
-        param_units=("m", ""),
-        param_low=(0.0, -1.0),
-        param_high=(2.0, 1.0),
-        constraint="sigmoid",
-        task={"name": "walk", "balance": {"heading_gain": 0.5}},
-    )
-    return dataclasses.replace(policy, **changes)
+def policy_of(features: FeatureMap, num_params: int = 2) -> LinearGaussian:
+    coef = np.random.default_rng(0).normal(size=(features.size, num_params))
+    return LinearGaussian(jnp.asarray(coef, jnp.float32), jnp.eye(num_params))
 
 
-def rbf_mean(policy: SavedPolicy, context: float) -> np.ndarray:
-    centres = np.linspace(policy.context_low[0], policy.context_high[0], policy.features.num_centers)
-    width = (policy.context_high[0] - policy.context_low[0]) / policy.features.num_centers
-    weights = np.exp(-((context - centres) ** 2) / (2 * width**2))
-    return weights / weights.sum() @ policy.coef
+def make_policy(features: FeatureMap = RBF, contexts: Space = SPEED, parameters: Space = WALK) -> Learned:
+    task = {"name": "walk", "balance": {"heading_gain": 0.5}}
+    return Learned(policy_of(features, parameters.size), features, contexts, parameters, task)
 
 
-def test_a_policy_comes_back_as_it_was_saved(tmp_path):
-    policy = make_policy()
-    save_policy(tmp_path / "policy.npz", policy)
-    loaded = load_policy(tmp_path / "policy.npz")
-    for field in dataclasses.fields(SavedPolicy):
-        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(policy, field.name))
+def cubic(context):
+    return jnp.concatenate([jnp.ones(1), context**3])
+
+
+CUBIC = FeatureMap(cubic, 2, 1, name="cubic")
+FEATURES = {
+    "rbf": (RBF, SPEED),
+    "wide rbf": (rbf_features(-1.0, 3.0, 3, bandwidth=0.5), SPEED),
+    "linear": (linear_features(1), SPEED),
+    "quadratic": (quadratic_features(1), SPEED),
+    "polynomial": (polynomial_features(2, 3), Space(("speed", "slope"), (0.1, -5.0), (0.6, 5.0))),
+    "rbf per axis": (rbf_features([0, 0], [1, 1], (2, 3)), Space(("x", "y"), (0.0, 0.0), (1.0, 1.0))),
+    "own": (CUBIC, SPEED),
+}
+
+
+def assert_same(one: Learned, other: Learned) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one.policy, other.policy)
+    for field in ("features", "contexts", "parameters", "task"):
+        assert getattr(one, field) == getattr(other, field)
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_a_policy_comes_back_as_it_was_saved(tmp_path, name):
+    features, contexts = FEATURES[name]
+    policy = make_policy(features, contexts)
+    policy.save(tmp_path / "policy.npz")
+    assert_same(cj.load(tmp_path / "policy.npz", features=CUBIC if name == "own" else None), policy)
+
+
+def test_features_of_a_user_need_a_name_and_come_along(tmp_path):
+    path = tmp_path / "policy.npz"
+    with pytest.raises(ValueError, match=r"must have a name to be saved, FeatureMap\(\.\.\., name='mine'\)"):
+        make_policy(FeatureMap(cubic, 2, 1)).save(path)
+    make_policy(CUBIC).save(path)
+    for wrong in (None, linear_features(1), FeatureMap(cubic, 2, 1, name="other")):
+        with pytest.raises(
+            ValueError, match="must be the FeatureMap named 'cubic', of 2 features of 1 context"
+        ):
+            load(path, features=wrong)
 
 
 @pytest.mark.parametrize("context", [0.1, 0.37, 0.6, float(np.float32(0.6)), np.float32(0.1)])
-def test_theta_is_the_squashed_mean(context):
+def test_parameters_are_the_squashed_mean_by_name(context):
     policy = make_policy()
-    low, high = np.array(policy.param_low), np.array(policy.param_high)
-    expected = low + (high - low) / (1 + np.exp(-rbf_mean(policy, context)))
+    centres, width = np.linspace(0.1, 0.6, 4), 0.5 / 4
+    weights = np.exp(-((context - centres) ** 2) / (2 * width**2))
+    mean = weights / weights.sum() @ np.asarray(policy.policy.coef)
+    low, high = np.array(WALK.low), np.array(WALK.high)
+    expected = low + (high - low) / (1 + np.exp(-mean))
     np.testing.assert_allclose(policy.theta(context), expected, rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(policy.thetas)(jnp.full((2, 1), context))[1], expected, rtol=1e-5)
+    named = policy(context)
+    assert list(named) == ["a", "b"] and all(type(value) is float for value in named.values())
+    np.testing.assert_allclose(list(named.values()), expected, rtol=1e-5)
 
 
-def test_theta_of_other_constraints_and_features():
-    linear = make_policy(
-        coef=np.array([[1.0, -3.0], [10.0, 0.0]]), features=Features("linear"), constraint="none"
-    )
-    np.testing.assert_allclose(linear.theta(0.5), [6.0, -3.0], rtol=1e-6)
-    clipped = dataclasses.replace(linear, constraint="penalty")
+def test_parameters_of_other_constraints():
+    policy = LinearGaussian(jnp.array([[1.0, -3.0], [10.0, 0.0]]), jnp.eye(2))
+    free = Learned(policy, linear_features(1), SPEED, dataclasses.replace(WALK, constraint="none"))
+    np.testing.assert_allclose(free.theta(0.5), [6.0, -3.0], rtol=1e-6)
+    clipped = dataclasses.replace(free, parameters=dataclasses.replace(WALK, constraint="clip"))
     np.testing.assert_allclose(clipped.theta(0.5), [2.0, -1.0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("context", [0.09, 0.7, -1.0, float("nan"), float("inf")])
-def test_a_context_outside_the_learned_range_is_refused(context):
-    with pytest.raises(ValueError, match=r"learned range, 0\.1 to 0\.6 m/s, got"):
-        make_policy().theta(context)
+def test_a_context_outside_the_learned_range_is_refused_and_can_be_asked_for(context):
+    with pytest.raises(ValueError, match=r"speed must be within the learned range, 0\.1 to 0\.6 m/s, got"):
+        make_policy()(context)
+    assert not make_policy().in_range(context)
+    assert make_policy().in_range(0.6)
 
 
-@pytest.mark.parametrize("context", ["fast", None, [0.1, 0.2]])
+@pytest.mark.parametrize("context", [("fast",), (None,), ([0.1, 0.2],), (), (0.1, 0.2)])
 def test_a_context_that_is_no_number_is_refused(context):
-    with pytest.raises(UserError, match="expected a number for each of speed, got"):
-        make_policy().theta(context)
+    for use in (make_policy(), make_policy().in_range):
+        with pytest.raises(ValueError, match="values must be a number for each of speed, got"):
+            use(*context)
 
 
 def test_several_context_variables_each_have_a_range():
-    policy = make_policy(
-        context_names=("speed", "slope"),
-        context_units=("m/s", "deg"),
-        context_low=(0.1, -5.0),
-        context_high=(0.6, 5.0),
-        features=Features("linear"),
-        coef=np.array([[1.0, 0.0], [2.0, 0.0], [0.1, 1.0]]),
-        constraint="none",
-    )
+    contexts = Space(("speed", "slope"), (0.1, -5.0), (0.6, 5.0), ("m/s", "deg"))
+    coef = jnp.array([[1.0, 0.0], [2.0, 0.0], [0.1, 1.0]])
+    parameters = dataclasses.replace(WALK, constraint="none")
+    policy = Learned(LinearGaussian(coef, jnp.eye(2)), linear_features(2), contexts, parameters)
     np.testing.assert_allclose(policy.theta(0.5, -3.0), [1.7, -3.0], rtol=1e-6)
-    with pytest.raises(UserError, match=r"slope must be within the learned range, -5 to 5 deg, got 6"):
+    with pytest.raises(ValueError, match=r"slope must be within the learned range, -5 to 5 deg, got 6"):
         policy.theta(0.5, 6.0)
-    with pytest.raises(UserError, match=r"a number for each of speed, slope, got \(0\.5,\)"):
+    with pytest.raises(ValueError, match=r"a number for each of speed, slope, got 0\.5"):
         policy.theta(0.5)
 
 
+def damaged(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """Return policy files that no policy can be read from, by what is wrong."""
+    changes = {
+        "not finite": {"coef": np.full_like(arrays["coef"], np.nan)},
+        "infinite": {"cov_chol": np.full_like(arrays["cov_chol"], np.inf)},
+        "too few features": {"coef": arrays["coef"][:3]},
+        "covariance": {"cov_chol": np.zeros((3, 3))},
+        "too few units": {"param_units": np.array(["m"])},
+        "constraint": {"constraint": "hope"},
+        "kind": {"features": json.dumps({"kind": "cubic"})},
+        "no json": {"features": "{"},
+        "range": {"context_range": np.array([[0.1], [np.nan]])},
+        "reversed": {"param_bounds": arrays["param_bounds"][::-1]},
+        "no context": {"context_names": np.array([], "U1")},
+        "equal names": {"param_names": np.array(["a", "a"])},
+    }
+    return {name: {**arrays, **change} for name, change in changes.items()}
+
+
+def test_what_is_no_policy_is_not_loaded(tmp_path):
+    path = tmp_path / "policy.npz"
+    make_policy().save(path)
+    for name, arrays in damaged(files.load_arrays(path)).items():
+        files.save_arrays(path, arrays)
+        with pytest.raises(UserError, match=r"policy\.npz") as caught:
+            load(path)
+        assert "\n" not in str(caught.value), name
+
+
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "match"),
     [
-        {"coef": np.full((4, 2), np.nan)},
-        {"cov_chol": np.full((2, 2), np.inf)},
-        {"coef": np.zeros((3, 2))},
-        {"cov_chol": np.zeros((3, 3))},
-        {"param_units": ("m",)},
-        {"constraint": "hope"},
-        {"features": Features("cubic")},
-        {"context_high": (float("nan"),)},
-        {"context_units": ()},
+        ({"policy": LinearGaussian(jnp.zeros((3, 2)), jnp.eye(2))}, r"coef \(4, 2\) .* got \(3, 2\)"),
+        ({"policy": LinearGaussian(jnp.full((4, 2), jnp.nan), jnp.eye(2))}, "policy must be finite"),
+        ({"contexts": Space(("x", "y"), (0, 0), (1, 1))}, "features must be of the contexts x, y, got 1"),
     ],
 )
-def test_what_is_no_policy_is_neither_saved_nor_loaded(tmp_path, changes, monkeypatch):
-    path = tmp_path / "policy.npz"
-    with pytest.raises(UserError):
-        save_policy(path, make_policy(**changes))
-    assert not path.exists()
-    monkeypatch.setattr("creps_jax.policies.learned._check", lambda *_: None)
-    save_policy(path, make_policy(**changes))
-    monkeypatch.undo()
-    with pytest.raises(UserError) as caught:
-        load_policy(path)
-    assert "\n" not in str(caught.value)
+def test_fields_that_do_not_fit_each_other_are_refused(changes, match):
+    with pytest.raises(ValueError, match=match):
+        dataclasses.replace(make_policy(), **changes)
 
 
 def test_a_policy_file_is_named_as_what_it_is(tmp_path):
-    save_policy(str(tmp_path / "policy.npz"), make_policy())
-    load_policy(str(tmp_path / "policy.npz"))
+    save(str(tmp_path / "policy.npz"), make_policy())
+    load(str(tmp_path / "policy.npz"))
     for path in (tmp_path / "policy.onnx", tmp_path / "policy"):
         with pytest.raises(UserError, match=r"must be named \.npz, got .*policy"):
-            save_policy(path, make_policy())
-    with pytest.raises(UserError, match=r"must be a SavedPolicy, got \{\}"):
-        save_policy(tmp_path / "policy.npz", {})
-    for use in (load_policy, lambda path: save_policy(path, make_policy())):
-        with pytest.raises(UserError, match="path must be that of a file, got 5"):
-            use(5)
+            make_policy().save(path)
 
 
 def test_foreign_files_and_other_versions_are_refused(tmp_path):
     path = tmp_path / "policy.npz"
     files.save_arrays(path, {"coef": np.zeros((4, 2))})
     with pytest.raises(UserError, match="no policy file"):
-        load_policy(path)
-    save_policy(path, make_policy())
+        load(path)
+    save(path, make_policy())
     whole = files.load_arrays(path)
     files.save_arrays(path, {**whole, "version": 1})
-    with pytest.raises(UserError, match="version 1, expected 2"):
-        load_policy(path)
+    with pytest.raises(UserError, match="version 1, expected 2 or 3"):
+        load(path)
     for name in whole.keys() - {"format", "version"}:
         files.save_arrays(path, {key: values for key, values in whole.items() if key != name})
         with pytest.raises(UserError, match="incomplete"):
-            load_policy(path)
+            load(path)
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(UserError, match="cut short"):
-        load_policy(path)
+        load(path)
+
+
+@pytest.mark.parametrize("kind", ["rbf", "linear"])
+def test_files_of_version_2_are_read(tmp_path, kind):
+    path = tmp_path / "policy.npz"
+    policy = make_policy(RBF if kind == "rbf" else linear_features(1))
+    policy.save(path)
+    settings = {"kind": kind, "num_centers": 4, "bandwidth": None}
+    before = {"version": 2, "features": json.dumps(settings), "constraint": "penalty"}
+    files.save_arrays(path, {**files.load_arrays(path), **before})
+    clipped = dataclasses.replace(policy, parameters=dataclasses.replace(WALK, constraint="clip"))
+    assert_same(load(path), clipped)
+
+
+@pytest.mark.parametrize("robot", ["nao", "nao_h25"])
+def test_the_policies_that_come_along_can_be_loaded(robot):
+    for path in files.policies_folder(robot).glob("*.npz"):
+        learned = cj.load(path)
+        named = learned(*learned.contexts.low)
+        assert 0.0 <= named["step_length"] <= 0.2
+        assert feature_maps.describe(learned.features)["kind"] == "rbf"
+    assert isinstance(path, Path)

@@ -4,6 +4,7 @@ import csv
 import ctypes
 import dataclasses
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -16,39 +17,37 @@ import pytest
 
 from creps_jax.errors import UserError
 from creps_jax.files import load_arrays, policies_folder
-from creps_jax.policies.learned import Features, SavedPolicy, load_policy, save_policy
+from creps_jax.policies.feature_settings import Features
+from creps_jax.policies.features import quadratic_features
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.learned import Learned, load, save
+from creps_jax.policies.space import Space
 from creps_jax.robots.nao_geometry import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, MAX_JOINT_SPEED
 from creps_jax.robots.robot import NAO_H25
 from creps_jax.tools.cli import main
 from creps_jax.tools.export.c_header import make_header
 from creps_jax.tools.export.onnx_model import make_model
 
+NAMES = ("a b", "a-b", 'what?? "\\')
 SHIPPED = policies_folder() / "walk.npz"
 H25 = ("--robot", "nao_h25")
 NAN, INFINITE = float("nan"), float("inf")
 
 
-def make_policy(name: str, features: Features, constraint: str, *, num_contexts: int = 2) -> SavedPolicy:
+def make_policy(name: str, features: Features, constraint: str, *, num_contexts: int = 2) -> Learned:
     rng = np.random.default_rng(len(name))
     low, high = (0.1, -5.0)[:num_contexts], (0.6, 5.0)[:num_contexts]
     # Means of either sign that reach beyond the box.
     scale = np.ones((features.make(low, high).size, 1))
     if features.kind == "linear":
         scale[1:, 0] = 1.0 / np.array(high)
-    return SavedPolicy(
-        coef=(2.0 * scale * rng.normal(size=(len(scale), 3))).astype(np.float32),
-        cov_chol=np.eye(3, dtype=np.float32),
-        features=features,
-        context_names=("speed", "slope")[:num_contexts],
-        context_units=("m/s", "°")[:num_contexts],
-        context_low=low,
-        context_high=high,
-        param_names=("a b", "a-b", 'what?? "\\'),
-        param_units=("m", "", "rad*/s"),
-        param_low=(0.0, -1.0, 1.0),
-        param_high=(2.0, 1.0, 1.5),
-        constraint=constraint,
-        task={"name": name},
+    coef = (2.0 * scale * rng.normal(size=(len(scale), 3))).astype(np.float32)
+    return Learned(
+        LinearGaussian(coef, np.eye(3, dtype=np.float32)),
+        features.make(low, high),
+        Space(("speed", "slope")[:num_contexts], low, high, ("m/s", "°")[:num_contexts]),
+        Space(NAMES, (0.0, -1.0, 1.0), (2.0, 1.0, 1.5), ("m", "", "rad*/s"), constraint),
+        {"name": name},
     )
 
 
@@ -56,19 +55,19 @@ POLICIES = {
     policy.task["name"]: policy
     for policy in (
         make_policy("squashed", Features("rbf", 4), "sigmoid"),
-        make_policy("narrow", Features("rbf", 6, bandwidth=0.02), "penalty", num_contexts=1),
+        make_policy("narrow", Features("rbf", 6, bandwidth=0.02), "clip", num_contexts=1),
         make_policy("lonely", Features("rbf", 1), "sigmoid", num_contexts=1),
         make_policy("straight", Features("linear"), "sigmoid"),
-        make_policy("clipped", Features("linear"), "penalty"),
+        make_policy("clipped", Features("linear"), "clip"),
         make_policy("free", Features("linear"), "none"),
-        load_policy(SHIPPED),
+        load(SHIPPED),
     )
 }
 
 
-def contexts_of(policy: SavedPolicy) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def contexts_of(policy: Learned) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return contexts, the nearest ones that were learned for, and whether these are the same."""
-    low, high = np.float32(policy.context_low), np.float32(policy.context_high)
+    low, high = np.float32(policy.contexts.low), np.float32(policy.contexts.high)
     rng = np.random.default_rng(0)
     inside = low + (high - low) * rng.uniform(size=(12, len(low))).astype(np.float32)
     inside = np.concatenate([np.clip(inside, low, high), [low, high]])
@@ -79,15 +78,15 @@ def contexts_of(policy: SavedPolicy) -> tuple[np.ndarray, np.ndarray, np.ndarray
     return contexts, nearest, np.arange(len(contexts)) < len(inside)
 
 
-def assert_same(policy: SavedPolicy, run) -> None:
+def assert_same(policy: Learned, run) -> None:
     """Hold `run`, from contexts to parameters and in_range, against the policy's theta."""
     contexts, nearest, expected = contexts_of(policy)
     parameters, in_range = run(contexts)
     theta = np.array([policy.theta(*row.tolist()) for row in nearest])
-    low, high = np.float32(policy.param_low), np.float32(policy.param_high)
+    low, high = np.float32(policy.parameters.low), np.float32(policy.parameters.high)
     np.testing.assert_array_less(np.abs(parameters - theta) / (high - low), 1e-6)
     np.testing.assert_array_equal(in_range, expected)
-    if policy.constraint != "none":
+    if policy.parameters.constraint != "none":
         assert ((parameters >= low) & (parameters <= high)).all()
 
 
@@ -102,9 +101,9 @@ def test_the_onnx_model_computes_theta(name):
     session = onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
     assert_same(policy, lambda contexts: session.run(["parameters", "in_range"], {"context": contexts}))
     known = session.get_modelmeta().custom_metadata_map
-    for ours, field in (("parameter", "param"), ("context", "context")):
+    for ours, space in (("parameter", policy.parameters), ("context", policy.contexts)):
         for what in ("names", "units", "low", "high"):
-            assert json.loads(known[f"{ours}_{what}"]) == list(getattr(policy, f"{field}_{what}"))
+            assert json.loads(known[f"{ours}_{what}"]) == list(getattr(space, what))
     assert json.loads(known["task"]) == policy.task
     assert f"task {name}" in model.doc_string and "speed 0.1 to 0.6 m/s" in model.doc_string
 
@@ -143,7 +142,7 @@ def test_the_c_function_computes_theta(compiled, name):
     policy = POLICIES[name]
 
     def run(contexts):
-        parameters = np.full((len(contexts), len(policy.param_names)), NAN, np.float32)
+        parameters = np.full((len(contexts), len(policy.parameters.names)), NAN, np.float32)
         in_range = [
             getattr(compiled, f"run_{name}")(as_floats(context), as_floats(row))
             for context, row in zip(contexts, parameters, strict=True)
@@ -153,7 +152,7 @@ def test_the_c_function_computes_theta(compiled, name):
     assert_same(policy, run)
     last_name = getattr(compiled, f"last_name_of_{name}")
     last_name.restype = ctypes.c_char_p
-    assert last_name().decode() == policy.param_names[-1]
+    assert last_name().decode() == policy.parameters.names[-1]
 
 
 def test_the_header_is_c_plus_plus_too(tmp_path):
@@ -181,12 +180,12 @@ def test_the_header_says_what_the_policy_is():
         for name, body in tables.items()
     }
     # Every number reads back as the same float.
-    assert floats["walk_coef"] == policy.coef.ravel().tolist()
+    assert floats["walk_coef"] == policy.policy.coef.ravel().tolist()
     assert floats["walk_context_low"] + floats["walk_context_high"] == [np.float32(0.1), np.float32(0.6)]
-    assert floats["walk_parameter_low"] == np.float32(policy.param_low).tolist()
-    assert floats["walk_parameter_high"] == np.float32(policy.param_high).tolist()
-    assert re.findall('"(.*)"', tables["walk_parameter_names"]) == list(policy.param_names)
-    assert re.findall('"(.*)"', tables["walk_parameter_units"]) == list(policy.param_units)
+    assert floats["walk_parameter_low"] == np.float32(policy.parameters.low).tolist()
+    assert floats["walk_parameter_high"] == np.float32(policy.parameters.high).tolist()
+    assert re.findall('"(.*)"', tables["walk_parameter_names"]) == list(policy.parameters.names)
+    assert re.findall('"(.*)"', tables["walk_parameter_units"]) == list(policy.parameters.units)
     enum = re.search(r"enum walk_parameter \{(.*?)\}", header, flags=re.DOTALL)
     assert enum and enum[1].split(",")[3].strip() == "WALK_PARAMETER_STEP_DURATION"
     assert header.isascii() and max(map(len, header.splitlines())) <= 110
@@ -211,7 +210,24 @@ def test_names_in_c_are_identifiers(task, function):
 @pytest.mark.parametrize("make", [make_model, make_header])
 def test_numbers_beyond_single_precision_are_refused(make):
     with pytest.raises(UserError, match="param_high of the policy is too large for single precision"):
-        make(dataclasses.replace(POLICIES["free"], param_high=(2.0, 1e300, 1.5)))
+        bounded = dataclasses.replace(POLICIES["clipped"].parameters, high=(2.0, 1e300, 1.5))
+        make(dataclasses.replace(POLICIES["clipped"], parameters=bounded))
+
+
+@pytest.mark.parametrize("make", [make_model, make_header])
+def test_features_that_cannot_be_exported_are_named(make):
+    contexts = Space(("speed",), (0.1,), (0.6,))
+    features = quadratic_features(1)
+    policy = LinearGaussian(np.zeros((2, 3)), np.eye(3))
+    with pytest.raises(UserError, match="features must be linear or rbf to be exported, got quadratic"):
+        make(Learned(policy, features, contexts, POLICIES["free"].parameters))
+
+
+def test_parameters_without_bounds_are_exported():
+    free = Space(NAMES, (-math.inf,) * 3, (math.inf,) * 3)
+    policy = dataclasses.replace(POLICIES["free"], parameters=free)
+    assert "-INFINITY, -INFINITY" in make_header(policy)
+    onnx.checker.check_model(make_model(policy), full_check=True)
 
 
 @pytest.fixture
@@ -226,7 +242,7 @@ def test_the_command_writes_policies(folder, capsys):
     assert main(["export", "--to", "walk.h"]) == 0
     assert (folder / "walk.h").read_text() == make_header(POLICIES["walk"])
     assert capsys.readouterr().out == f"policy: {SHIPPED}\nC header: walk.h\n"
-    save_policy(folder / "reach.npz", POLICIES["squashed"])
+    save(folder / "reach.npz", POLICIES["squashed"])
     assert main(["export", "--policy", "reach.npz", "--to", "new/reach.ONNX"]) == 0
     assert onnx.load(folder / "new" / "reach.ONNX") == make_model(POLICIES["squashed"])
     assert {path.name for path in folder.rglob("*")} == {"walk.h", "reach.npz", "new", "reach.ONNX"}
@@ -261,13 +277,13 @@ def test_a_robot_gets_its_own_policy_and_set_points(folder, capsys):
     left, right = (set_point[:, JOINT_NAMES.index(f"{side}_hip_yaw_pitch")] for side in ("left", "right"))
     np.testing.assert_allclose(left, right, atol=1e-6)
     assert main(["export", "--robot", "nao_h25", "--to", "h25.h"]) == 0
-    assert (folder / "h25.h").read_text() == make_header(load_policy(shipped))
+    assert (folder / "h25.h").read_text() == make_header(load(shipped))
 
 
 def test_mistakes_are_one_clear_line(folder, capsys):
     other = dataclasses.replace(POLICIES["walk"], task={**POLICIES["walk"].task, "name": "swim"})
     for name, policy in (("reach", POLICIES["squashed"]), ("walk", POLICIES["walk"]), ("swim", other)):
-        save_policy(folder / f"{name}.npz", policy)
+        save(folder / f"{name}.npz", policy)
     (folder / "file").touch()
     (folder / "folder.h").mkdir()
     walk = ["--to", "walk.csv", "--speed", "0.3"]
@@ -289,4 +305,4 @@ def test_mistakes_are_one_clear_line(folder, capsys):
         assert match in error
         assert len(error.splitlines()) == 1
     assert not (folder / "walk.csv").exists()
-    load_policy(folder / "walk.npz")
+    load(folder / "walk.npz")

@@ -18,9 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from creps_jax import files
 from creps_jax.errors import UserError
 from creps_jax.policies.features import rbf_features
-from creps_jax.policies.learned import Features, SavedPolicy, load_policy, save_policy
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.learned import Learned, load
+from creps_jax.policies.space import Space
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import creps
 from creps_jax.search.fit import bounded_ml
@@ -62,7 +65,7 @@ def run_batches(session: RobotSession, number: int) -> None:
             session.tell(trial.id, reward_of(trial))
 
 
-def files(folder: Path) -> dict[str, bytes]:
+def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
@@ -78,9 +81,9 @@ def test_asked_trials_stay_the_same_until_they_are_told(session):
         assert 1.0 <= trial.parameters["speed"] <= 6.0
         assert 10.0 <= trial.parameters["angle"] <= 80.0
     assert len({trial.theta for trial in trials}) == 4
-    before = files(session.folder)
+    before = contents(session.folder)
     assert session.ask() == trials == RobotSession.open(session.folder).ask()
-    assert files(session.folder) == before
+    assert contents(session.folder) == before
     session.tell(2, -1.0)
     assert [trial.id for trial in session.ask()] == [1, 3, 4]
     assert [trial.id for trial in session.ask(more=2)] == [1, 3, 4, 5, 6]
@@ -117,15 +120,16 @@ def test_the_first_policy_has_start_and_spread_in_the_units_of_the_parameters(se
     )
     low, high = np.array([1.0, 10.0]), np.array([6.0, 80.0])
     start, spread = np.array([3.0, 45.0]), np.array([0.5, 70.0 / 8])
-    first = session.policy()
+    first = session.policy().policy
     share = 1 / (1 + np.exp(-first.coef))
     np.testing.assert_allclose(low + (high - low) * share, np.tile(start, (3, 1)), rtol=1e-5)
     slope = (high - low) * share[0] * (1 - share[0])
     np.testing.assert_allclose(np.diag(first.cov_chol) * slope, spread, rtol=1e-5)
-    first = clipped.policy()
+    first = clipped.policy().policy
+    constraints = [each.policy().parameters.constraint for each in (clipped, session)]
+    assert constraints == ["clip", "sigmoid"]
     np.testing.assert_allclose(first.coef, [start, np.zeros(2)])
     np.testing.assert_allclose(first.cov_chol, np.diag([0.5, 30.0]))
-    assert (first.constraint, session.policy().constraint) == ("penalty", "sigmoid")
     # What is cut off at the bounds is not learned from either.
     trials = clipped.ask(more=100)
     assert min(trial.parameters["angle"] for trial in trials) == 10.0
@@ -171,14 +175,14 @@ def test_replaying_gives_the_same_bits(session):
     replayed = RobotSession.open(session.folder)
     assert len(session.status().updates) == 3
     assert bits(replayed.status().updates) == bits(session.status().updates)
-    assert bits(replayed.policy().coef) == bits(session.policy().coef)
+    assert bits(replayed.policy().policy.coef) == bits(session.policy().policy.coef)
     assert replayed.ask() == RobotSession.open(session.folder).ask()
 
 
 def test_telling_is_idempotent_and_what_was_learned_from_stays(session):
     session.ask()
     assert session.tell(3, -1.5).is_new
-    before = files(session.folder)
+    before = contents(session.folder)
     assert not session.tell(3, -1.5).is_new
     with pytest.raises(
         UserError, match=r"trial 3 has been told already, reward -1\.5, not reward -2\.0; add --rep"
@@ -194,7 +198,7 @@ def test_telling_is_idempotent_and_what_was_learned_from_stays(session):
     for reward in (math.inf, -math.inf, 1e39):
         with pytest.raises(UserError, match="trial 1 must be finite, or NaN if broken"):
             session.tell(1, reward)
-    assert files(session.folder) == before
+    assert contents(session.folder) == before
 
     assert session.tell(3, -2.0, replace=True).trial.reward == -2.0
     assert session.tell(1, math.nan).trial.is_broken
@@ -290,7 +294,7 @@ def test_one_process_at_a_time_others_wait_or_say_so(session, monkeypatch):
 def test_a_full_disk_is_named_and_leaves_everything_as_it_was(session, tmp_path, monkeypatch, place):
     run_batches(session, 1)
     session.ask()
-    before = files(session.folder)
+    before = contents(session.folder)
 
     def full(*_, **__):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -304,7 +308,7 @@ def test_a_full_disk_is_named_and_leaves_everything_as_it_was(session, tmp_path,
     ):
         with pytest.raises(UserError, match="No space left on device"):
             action()
-    assert files(session.folder) == before
+    assert contents(session.folder) == before
     assert [path.name for path in tmp_path.iterdir()] == ["arm"]
     monkeypatch.undo()
     assert session.tell(5, -1.0).is_new
@@ -334,11 +338,11 @@ def test_a_spoiled_file_is_named_and_left_alone(session, name, spoil):
     if spoil != "missing":
         texts = {"cut": whole[:-20], "empty": b"", "binary": b"\xff\x00\x81", "list": b"[1]"}
         path.write_bytes(texts.get(spoil, b'{"hello": 1}'))
-    before = files(session.folder)
+    before = contents(session.folder)
     with pytest.raises(UserError, match=name.replace(".", r"\.")) as caught:
         RobotSession.open(session.folder).tell(1, -1.0)
     assert "\n" not in str(caught.value)
-    assert files(session.folder) == before
+    assert contents(session.folder) == before
 
 
 @pytest.mark.parametrize(
@@ -452,10 +456,10 @@ def test_a_definition_names_each_field_once_and_the_folder_is_new(tmp_path, sess
     (tmp_path / "arm.json").write_text('{"seed": 0, "contexts": [], "seed": 1}')
     with pytest.raises(UserError, match=r"arm\.json: the field 'seed' is there twice"):
         RobotSession.create(tmp_path / "new", define=tmp_path / "arm.json")
-    before = files(session.folder)
+    before = contents(session.folder)
     with pytest.raises(UserError, match="arm is there already"):
         RobotSession.create(session.folder, define=DEFINITION)
-    assert files(session.folder) == before
+    assert contents(session.folder) == before
     with pytest.raises(UserError, match="either with a policy"):
         RobotSession.create(tmp_path / "new")
     with pytest.raises(UserError, match="exploration goes with a policy"):
@@ -464,25 +468,22 @@ def test_a_definition_names_each_field_once_and_the_folder_is_new(tmp_path, sess
         RobotSession.create(tmp_path / "new", define=DEFINITION, batch_sise=3)
 
 
-def simulated_policy(**changes) -> SavedPolicy:
+def simulated_policy() -> Learned:
     """Return a policy of the variables of DEFINITION, with numbers that decimals do not have."""
     rng = np.random.default_rng(0)
-    policy = SavedPolicy(
-        coef=rng.normal(size=(3, 2)).astype(np.float32) / 3,
-        cov_chol=np.tril(rng.uniform(0.1, 0.3, size=(2, 2))).astype(np.float32),
-        features=Features("rbf", 3),
-        context_names=("distance",),
-        context_units=("m",),
-        context_low=(0.5,),
-        context_high=(2.0,),
-        param_names=("speed", "angle"),
-        param_units=("m/s", "deg"),
-        param_low=(1.0, 10.0),
-        param_high=(6.0, 80.0),
-        constraint="sigmoid",
-        task={"name": "throw", "balance": {"heading_gain": 0.3}},
+    return Learned(
+        LinearGaussian(rng.normal(size=(3, 2)) / 3, np.tril(rng.uniform(0.1, 0.3, size=(2, 2)))),
+        rbf_features(0.5, 2.0, 3),
+        Space(("distance",), (0.5,), (2.0,), ("m",)),
+        Space(("speed", "angle"), (1.0, 10.0), (6.0, 80.0), ("m/s", "deg"), "sigmoid"),
+        {"name": "throw", "balance": {"heading_gain": 0.3}},
     )
-    return dataclasses.replace(policy, **changes)
+
+
+def assert_same(one: Learned, other: Learned) -> None:
+    jax.tree.map(np.testing.assert_array_equal, one.policy, other.policy)
+    for field in ("features", "contexts", "parameters", "task"):
+        assert getattr(one, field) == getattr(other, field)
 
 
 def test_json_for_people_says_the_same_in_lines_that_are_not_long():
@@ -505,16 +506,21 @@ def test_json_for_people_says_the_same_in_lines_that_are_not_long():
 def test_a_session_from_a_policy_begins_with_it(tmp_path):
     policy = simulated_policy()
     same = RobotSession.create(tmp_path / "same", policy=policy).policy()
-    for field in dataclasses.fields(SavedPolicy):
-        np.testing.assert_array_equal(getattr(same, field.name), getattr(policy, field.name))
-    save_policy(tmp_path / "policy.npz", policy)
+    assert_same(same, policy)
+    policy.save(tmp_path / "policy.npz")
     narrow = RobotSession.create(tmp_path / "narrow", policy=tmp_path / "policy.npz", exploration=0.5)
-    np.testing.assert_array_equal(narrow.policy().coef, policy.coef)
-    np.testing.assert_array_equal(narrow.policy().cov_chol, 0.5 * policy.cov_chol)
+    np.testing.assert_array_equal(narrow.policy().policy.coef, policy.policy.coef)
+    np.testing.assert_array_equal(narrow.policy().policy.cov_chol, 0.5 * policy.policy.cov_chol)
     assert narrow.settings.archive_size == 50
     assert RobotSession.open(tmp_path / "narrow").settings == narrow.settings
-    plain = RobotSession.create(tmp_path / "plain", policy=simulated_policy(constraint="none"))
+    unbound = dataclasses.replace(
+        policy, parameters=dataclasses.replace(policy.parameters, constraint="none")
+    )
+    plain = RobotSession.create(tmp_path / "plain", policy=unbound)
     assert plain.settings.constraint == "clip"
+    elsewhere = dataclasses.replace(policy, features=rbf_features(0.0, 3.0, 3))
+    with pytest.raises(UserError, match="a session must begin with linear features, or with RBFs over"):
+        RobotSession.create(tmp_path / "other", policy=elsewhere)
     for exploration in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(UserError, match="exploration must be above zero and finite"):
             RobotSession.create(tmp_path / "new", policy=policy, exploration=exploration)
@@ -562,7 +568,7 @@ def test_the_commands_lead_through_a_session(tmp_path, monkeypatch, capsys):
     assert Path("arm/status.png").read_bytes().startswith(b"\x89PNG")
     command("save", "arm", "--to", "learned.npz")
     session = RobotSession.open("arm")
-    np.testing.assert_array_equal(load_policy(Path("learned.npz")).coef, session.policy().coef)
+    np.testing.assert_array_equal(load(Path("learned.npz")).policy.coef, session.policy().policy.coef)
     assert "holds no robot session" in command("status", "nowhere", code=2)
 
 

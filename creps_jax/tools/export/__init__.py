@@ -8,7 +8,7 @@ from creps_jax.errors import UserError
 from creps_jax.tools.process import import_mjx_quietly
 
 if TYPE_CHECKING:
-    from creps_jax.policies.learned import SavedPolicy
+    from creps_jax.policies.learned import Learned
 
 _OF_POLICY = {".onnx": "ONNX model", ".h": "C header"}
 _OF_WALK = {".csv": "CSV table", ".npz": "NumPy arrays"}
@@ -50,10 +50,10 @@ def export(
         walk = trajectory.plan(path, speed, _DURATION if duration is None else duration, robot=robot)
         {".csv": trajectory.save_csv, ".npz": trajectory.save_npz}[ending](to, walk)
     else:
-        from creps_jax.policies.learned import load_policy
+        from creps_jax.policies.learned import load
         from creps_jax.tools.export import c_header, onnx_model
 
-        saved = load_policy(path) if robot is None else _load_walking_policy(path, robot)
+        saved = load(path) if robot is None else _load_walking_policy(path, robot)
         {".onnx": onnx_model.save, ".h": c_header.save}[ending](to, saved)
     say(f"policy: {path}")
     say(f"{(_OF_POLICY | _OF_WALK)[ending]}: {to}")
@@ -88,7 +88,7 @@ def _default_policy(robot: str | None) -> Path:
     return default_policy(robot)
 
 
-def _load_walking_policy(path: Path, robot: str) -> "SavedPolicy":
+def _load_walking_policy(path: Path, robot: str) -> "Learned":
     import_mjx_quietly()
     from creps_jax.tools.play import load_walking_policy
 

@@ -100,4 +100,4 @@ _CLIP = """\
         value = value < low ? low : value > high ? high : value;
 """
 # After a sigmoid the clip takes back the last bit that rounding can put outside the box.
-HOLD_BOUNDS = {"none": "", "penalty": _BOUNDS + _CLIP, "sigmoid": _BOUNDS + _SQUASH + _CLIP}
+HOLD_BOUNDS = {"none": "", "clip": _BOUNDS + _CLIP, "sigmoid": _BOUNDS + _SQUASH + _CLIP}

@@ -8,23 +8,22 @@ from pathlib import Path
 
 import numpy as np
 
-from creps_jax.files import save_text
-from creps_jax.policies.learned import SavedPolicy
+from creps_jax.files import package_version, save_text
+from creps_jax.policies.learned import Learned
 from creps_jax.tools.export.c_code import HEADER, HOLD_BOUNDS, LINEAR, RBF
 from creps_jax.tools.export.formula import Formula, formula_of
-from creps_jax.tools.results import project_version
 
 # Characters that stand for themselves in a C string: no quotes, backslashes, nor "?", of which two begin
 # a trigraph.
 _PLAIN = string.ascii_letters + string.digits + " _.,:;/^*+-=%()[]"
 
 
-def save(path: Path, policy: SavedPolicy) -> None:
+def save(path: Path, policy: Learned) -> None:
     """Write a policy as a C header, atomically."""
     save_text(path, make_header(policy))
 
 
-def make_header(policy: SavedPolicy) -> str:
+def make_header(policy: Learned) -> str:
     """Return a header of C99, and C++, with names, units, bounds, range and function of a policy.
 
     What it declares begins with the name of the task; characters that C has not become underscores.
@@ -36,38 +35,38 @@ def make_header(policy: SavedPolicy) -> str:
     prefix = _prefix(policy)
     names = {"prefix": prefix, "PREFIX": prefix.upper()}
     features = RBF if len(formula.centers) else LINEAR
-    is_bounded = policy.constraint != "none"
+    is_bounded = policy.parameters.constraint != "none"
     held = f", within {prefix}_parameter_low to {prefix}_parameter_high" if is_bounded else ""
     middle = 0.5 * (formula.context_low + formula.context_high)
     return HEADER.substitute(
         names,
-        version=project_version(),
+        version=package_version(),
         example=", ".join(f"{value:g}" for value in middle),
-        first=_enumerators(f"{prefix}_PARAMETER", policy.param_names)[0],
-        num_contexts=len(policy.context_names),
-        num_params=len(policy.param_names),
+        first=_enumerators(f"{prefix}_PARAMETER", policy.parameters.names)[0],
+        num_contexts=len(policy.contexts.names),
+        num_params=len(policy.parameters.names),
         num_features=len(formula.coef),
         tables=_tables(policy, formula, prefix),
         held=held,
         compute_features=string.Template(features).substitute(names),
-        hold_bounds=string.Template(HOLD_BOUNDS[policy.constraint]).substitute(names),
+        hold_bounds=string.Template(HOLD_BOUNDS[policy.parameters.constraint]).substitute(names),
     )
 
 
-def _tables(policy: SavedPolicy, formula: Formula, prefix: str) -> str:
+def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
     """Declare the indices, names, units and numbers of a policy."""
     contexts, params, features = (
         f"{prefix.upper()}_NUM_{what}" for what in ("CONTEXTS", "PARAMETERS", "FEATURES")
     )
     tables = [
-        _enum(f"{prefix}_context", policy.context_names),
-        _enum(f"{prefix}_parameter", policy.param_names),
-        _strings(f"{prefix}_context_names[{contexts}]", policy.context_names),
-        _strings(f"{prefix}_context_units[{contexts}]", policy.context_units),
+        _enum(f"{prefix}_context", policy.contexts.names),
+        _enum(f"{prefix}_parameter", policy.parameters.names),
+        _strings(f"{prefix}_context_names[{contexts}]", policy.contexts.names),
+        _strings(f"{prefix}_context_units[{contexts}]", policy.contexts.units),
         _floats(f"{prefix}_context_low[{contexts}]", formula.context_low),
         _floats(f"{prefix}_context_high[{contexts}]", formula.context_high),
-        _strings(f"{prefix}_parameter_names[{params}]", policy.param_names),
-        _strings(f"{prefix}_parameter_units[{params}]", policy.param_units),
+        _strings(f"{prefix}_parameter_names[{params}]", policy.parameters.names),
+        _strings(f"{prefix}_parameter_units[{params}]", policy.parameters.units),
         _floats(f"{prefix}_parameter_low[{params}]", formula.param_low),
         _floats(f"{prefix}_parameter_high[{params}]", formula.param_high),
         _floats(f"{prefix}_coef[{features}][{params}]", formula.coef),
@@ -78,7 +77,7 @@ def _tables(policy: SavedPolicy, formula: Formula, prefix: str) -> str:
     return "\n".join(tables)
 
 
-def _prefix(policy: SavedPolicy) -> str:
+def _prefix(policy: Learned) -> str:
     """Return the task's name as the beginning of C identifiers."""
     name = _identifier(str(policy.task.get("name", ""))).lower()
     return f"task_{name}" if name[:1].isdigit() else name or "learned"
@@ -123,5 +122,7 @@ def _string(text: str) -> str:
 
 def _number(value: np.floating) -> str:
     """Write a float literal that reads back as the same number."""
+    if np.isinf(value):
+        return "INFINITY" if value > 0 else "-INFINITY"
     digits = f"{value:.9g}"
     return f"{digits}f" if set(digits) & set(".e") else f"{digits}.0f"

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from creps_jax.errors import UserError
-from creps_jax.policies.features import rbf_grid
-from creps_jax.policies.learned import SavedPolicy
+from creps_jax.policies.features import describe, rbf_grid
+from creps_jax.policies.learned import Learned
 
 
 class Formula(NamedTuple):
@@ -31,31 +31,36 @@ class Formula(NamedTuple):
     param_high: np.ndarray
 
 
-def formula_of(policy: SavedPolicy) -> Formula:
+def formula_of(learned: Learned) -> Formula:
     """Gather the numbers of a policy.
 
     Raises:
-        UserError: if one is too large for single precision.
+        UserError: if its features cannot be exported, or a number is too large for single precision.
     """
-    num_contexts = len(policy.context_names)
+    num_contexts = learned.contexts.size
     centers, widths = np.zeros((0, num_contexts)), np.ones(num_contexts)
-    if policy.features.kind == "rbf":
-        settings = policy.features
+    features = describe(learned.features)
+    if features["kind"] == "rbf":
         centers, widths = rbf_grid(
-            policy.context_low, policy.context_high, settings.num_centers, bandwidth=settings.bandwidth
+            features["low"], features["high"], features["num_centers"], bandwidth=features["width"]
         )
+    elif features["kind"] != "linear":
+        raise UserError(f"features must be linear or rbf to be exported, got {features['kind']}")
+    if not np.isfinite([learned.contexts.low, learned.contexts.high]).all():
+        raise UserError(f"contexts must have a range to be exported, got {learned.contexts}")
     numbers = Formula(
-        context_low=np.asarray(policy.context_low),
-        context_high=np.asarray(policy.context_high),
+        context_low=np.asarray(learned.contexts.low),
+        context_high=np.asarray(learned.contexts.high),
         centers=centers,
         widths=widths,
-        coef=policy.coef,
-        param_low=np.asarray(policy.param_low),
-        param_high=np.asarray(policy.param_high),
+        coef=np.asarray(learned.policy.coef),
+        param_low=np.asarray(learned.parameters.low),
+        param_high=np.asarray(learned.parameters.high),
     )
     with np.errstate(over="ignore"):
         single = Formula(*(np.asarray(values, np.float32) for values in numbers))
     for name, values in single._asdict().items():
-        if not np.isfinite(values).all():
+        is_bound = name.startswith("param") and learned.parameters.constraint == "none"
+        if not (np.isfinite(values).all() or is_bound):
             raise UserError(f"{name} of the policy is too large for single precision")
     return single

@@ -8,10 +8,10 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from creps_jax.files import write_atomically
-from creps_jax.policies.learned import SavedPolicy
+from creps_jax.files import package_version, write_atomically
+from creps_jax.policies.features import describe
+from creps_jax.policies.learned import Learned
 from creps_jax.tools.export.formula import Formula, formula_of
-from creps_jax.tools.results import project_version
 
 # As old as the operators allow (a ReduceSum whose axes are an input is of opset 13), so that old runtimes
 # read it too.
@@ -19,13 +19,13 @@ OPSET = 13
 IR_VERSION = 7
 
 
-def save(path: Path, policy: SavedPolicy) -> None:
+def save(path: Path, policy: Learned) -> None:
     """Write a policy as an ONNX model, atomically."""
     model = make_model(policy)
     write_atomically(path, lambda file: file.write(model.SerializeToString()))
 
 
-def make_model(policy: SavedPolicy) -> onnx.ModelProto:
+def make_model(policy: Learned) -> onnx.ModelProto:
     """Build the model: `context` (batch, s) to `parameters` (batch, d) and `in_range` (batch,).
 
     Context variables outside the learned range count as at its nearest end, NaN as at the lower one;
@@ -34,14 +34,15 @@ def make_model(policy: SavedPolicy) -> onnx.ModelProto:
     Raises:
         UserError: if a number of the policy is too large for single precision.
     """
-    nodes = [*_clamp(), *_mean(policy.features.kind), *_hold_bounds(policy.constraint)]
+    kind = describe(policy.features)["kind"]
+    nodes = [*_clamp(), *_mean(kind), *_hold_bounds(policy.parameters.constraint)]
     used = {name for node in nodes for name in node.input}
     constants = _constants(formula_of(policy))
     tensors = [numpy_helper.from_array(values, name) for name, values in constants.items() if name in used]
-    contexts, params = ", ".join(policy.context_names), ", ".join(policy.param_names)
+    contexts, params = ", ".join(policy.contexts.names), ", ".join(policy.parameters.names)
     value = helper.make_tensor_value_info
-    context = value("context", TensorProto.FLOAT, ["batch", len(policy.context_names)], contexts)
-    parameters = value("parameters", TensorProto.FLOAT, ["batch", len(policy.param_names)], params)
+    context = value("context", TensorProto.FLOAT, ["batch", len(policy.contexts.names)], contexts)
+    parameters = value("parameters", TensorProto.FLOAT, ["batch", len(policy.parameters.names)], params)
     in_range = value(
         "in_range", TensorProto.BOOL, ["batch"], "whether the context is within the learned range"
     )
@@ -49,7 +50,7 @@ def make_model(policy: SavedPolicy) -> onnx.ModelProto:
     model = helper.make_model(
         graph,
         producer_name="creps_jax",
-        producer_version=project_version(),
+        producer_version=package_version(),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         doc_string=_description(policy),
@@ -126,26 +127,26 @@ def _node(output: str, operator: str, *inputs: str, **attributes: Any) -> onnx.N
     return helper.make_node(operator, inputs, [output], **attributes)
 
 
-def _metadata(policy: SavedPolicy) -> dict[str, Any]:
+def _metadata(policy: Learned) -> dict[str, Any]:
     """List what a user of the model has to know."""
     return {
         "task": dict(policy.task),
-        "context_names": policy.context_names,
-        "context_units": policy.context_units,
-        "context_low": policy.context_low,
-        "context_high": policy.context_high,
-        "parameter_names": policy.param_names,
-        "parameter_units": policy.param_units,
-        "parameter_low": policy.param_low,
-        "parameter_high": policy.param_high,
-        "constraint": policy.constraint,
+        "context_names": policy.contexts.names,
+        "context_units": policy.contexts.units,
+        "context_low": policy.contexts.low,
+        "context_high": policy.contexts.high,
+        "parameter_names": policy.parameters.names,
+        "parameter_units": policy.parameters.units,
+        "parameter_low": policy.parameters.low,
+        "parameter_high": policy.parameters.high,
+        "constraint": policy.parameters.constraint,
     }
 
 
-def _description(policy: SavedPolicy) -> str:
+def _description(policy: Learned) -> str:
     """Say in words what the model computes."""
     ranges = zip(
-        policy.context_names, policy.context_low, policy.context_high, policy.context_units, strict=True
+        policy.contexts.names, policy.contexts.low, policy.contexts.high, policy.contexts.units, strict=True
     )
     learned = ", ".join(f"{name} {low:g} to {high:g} {unit}".rstrip() for name, low, high, unit in ranges)
     return (

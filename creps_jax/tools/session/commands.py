@@ -221,9 +221,7 @@ def _status(command: Status, say: Callable[[str], None]) -> None:
 
 def _save(command: Save, say: Callable[[str], None]) -> None:
     policy = RobotSession.open(command.folder).policy()
-    from creps_jax.policies.learned import save_policy
-
-    save_policy(command.to, policy)
+    policy.save(command.to)
     say(f"policy: {command.to}")
 
 

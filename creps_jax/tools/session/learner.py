@@ -17,14 +17,13 @@ from creps_jax.errors import UserError
 from creps_jax.policies import gaussian
 from creps_jax.policies.features import quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian
-from creps_jax.policies.learned import SavedPolicy
-from creps_jax.policies.space import sigmoid_gate
+from creps_jax.policies.learned import Learned
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import Creps, CrepsState, creps
 from creps_jax.search.fit import fit_within
 from creps_jax.tools.session.plain import shortest
 from creps_jax.tools.session.settings import Context, Settings, ends
-from creps_jax.tools.session.start import complete, feature_map, features_of, first_policy
+from creps_jax.tools.session.start import complete, feature_map, first_policy, space_of
 from creps_jax.tools.session.trials import Trial
 
 _GRID = 1000
@@ -121,23 +120,15 @@ class Learner:
         """Return a policy's mean parameters (n, d) at these contexts."""
         return np.asarray(self._programs.means(policy))
 
-    def saved_policy(self) -> SavedPolicy:
-        """Return the policy of today as other commands read it."""
+    def learned(self) -> Learned:
+        """Return the policy of today as other tools take it."""
         settings = self.settings
-        return SavedPolicy(
-            coef=np.asarray(self.policy.coef),
-            cov_chol=np.asarray(self.policy.cov_chol),
-            features=features_of(settings),
-            context_names=settings.context_names,
-            context_units=tuple(each.unit for each in settings.contexts),
-            context_low=tuple(each.low for each in settings.contexts),
-            context_high=tuple(each.high for each in settings.contexts),
-            param_names=settings.parameter_names,
-            param_units=tuple(each.unit for each in settings.parameters),
-            param_low=tuple(each.low for each in settings.parameters),
-            param_high=tuple(each.high for each in settings.parameters),
-            constraint="sigmoid" if settings.constraint == "sigmoid" else "penalty",
-            task=settings.task,
+        return Learned(
+            self.policy,
+            feature_map(settings),
+            space_of(settings.contexts),
+            space_of(settings.parameters, settings.constraint),
+            settings.task,
         )
 
     def _restart(self) -> None:
@@ -178,15 +169,12 @@ def _programs(settings: Settings) -> _Programs:
         grid = context_grid(low, high, round(_GRID ** (1 / num_contexts)))
     except ValueError as error:
         raise UserError(str(error)) from error
-    bounds = np.array(ends(settings.parameters), np.float32)
-
-    def bounded(theta: jax.Array) -> jax.Array:
-        return sigmoid_gate(theta, *bounds) if settings.constraint == "sigmoid" else jnp.clip(theta, *bounds)
+    inside = space_of(settings.parameters, settings.constraint).inside
 
     def propose(seed: jax.Array, trial: jax.Array, state: CrepsState, context: jax.Array) -> tuple:
         key = jax.random.fold_in(jax.random.key(seed), trial)
         theta = algorithm.ask(key, state, context[None])[0]
-        parameters = bounded(theta)
+        parameters = inside(theta)
         # What is cut off was never tried, and nothing is to be learned of it.
         return (theta if settings.constraint == "sigmoid" else parameters), parameters
 
@@ -199,7 +187,7 @@ def _programs(settings: Settings) -> _Programs:
         tell=algorithm.tell,
         propose=jax.jit(propose),
         grid=grid,
-        means=jax.jit(lambda policy: bounded(algorithm.mean(policy, grid))),
+        means=jax.jit(lambda policy: inside(algorithm.mean(policy, grid))),
         distance=jax.jit(distance),
     )
 

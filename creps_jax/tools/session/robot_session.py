@@ -15,7 +15,7 @@ from creps_jax.tools.session.settings import MAX_BATCH, Settings, load_settings
 from creps_jax.tools.session.trials import Record, Trial
 
 if TYPE_CHECKING:
-    from creps_jax.policies.learned import SavedPolicy
+    from creps_jax.policies.learned import Learned
     from creps_jax.tools.session.learner import Learner, Update
 
 LOCK_SECONDS = 30.0
@@ -75,7 +75,7 @@ class RobotSession:
         cls,
         folder: str | os.PathLike[str],
         *,
-        policy: "str | os.PathLike[str] | SavedPolicy | None" = None,
+        policy: "str | os.PathLike[str] | Learned | None" = None,
         define: str | os.PathLike[str] | Mapping[str, Any] | None = None,
         exploration: float | None = None,
         **changes: Any,
@@ -209,9 +209,9 @@ class RobotSession:
             parameters=learner.mean_parameters(learner.policy),
         )
 
-    def policy(self) -> "SavedPolicy":
-        """Return the policy of today, for `creps_jax.policies.learned.save_policy`."""
-        return self._learned(self._record()).saved_policy()
+    def policy(self) -> "Learned":
+        """Return the policy of today; its `save` writes a policy file."""
+        return self._learned(self._record()).learned()
 
     def _record(self) -> Record:
         return storage.load_record(self.folder, self.settings)
@@ -233,10 +233,10 @@ class RobotSession:
 
 
 def _settings_from(policy: Any, exploration: float) -> Settings:
-    from creps_jax.policies.learned import SavedPolicy, load_policy
+    from creps_jax.policies.learned import Learned, load
     from creps_jax.tools.session.start import settings_from_policy
 
-    saved = policy if isinstance(policy, SavedPolicy) else load_policy(Path(policy))
+    saved = policy if isinstance(policy, Learned) else load(Path(policy))
     return settings_from_policy(saved, exploration=exploration)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from creps_jax import files
 from creps_jax.errors import UserError
+from creps_jax.policies.feature_settings import Features
 from creps_jax.tools.session import plain
 
 CONSTRAINTS = ("sigmoid", "clip")
@@ -62,19 +63,6 @@ class Parameter(Context):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FeatureSettings:
-    """The features of the policy: the fields of `creps_jax.policies.learned.Features`.
-
-    By default there are 5 centres for one context variable, for two 3 along each, and 2 for more: a session
-    has few trials, and 25 centres learn nothing from fifty of them.
-    """
-
-    kind: str = "rbf"
-    num_centers: int | None = None
-    bandwidth: float | None = None
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class FirstPolicy:
     """The policy to begin with: the arrays of a `LinearGaussian`, by rows."""
 
@@ -110,7 +98,7 @@ class Settings:
 
     contexts: tuple[Context, ...]
     parameters: tuple[Parameter, ...]
-    features: FeatureSettings = FeatureSettings()
+    features: Features = Features()
     constraint: str = "sigmoid"
     kl_bound: float = 0.5
     mean_kl_bound: float | None = 0.5

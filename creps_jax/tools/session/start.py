@@ -3,49 +3,65 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 
 from creps_jax.errors import UserError
-from creps_jax.policies.features import FeatureMap
+from creps_jax.policies.feature_settings import Features
+from creps_jax.policies.features import FeatureMap, describe
 from creps_jax.policies.gaussian import LinearGaussian
-from creps_jax.policies.learned import Features, SavedPolicy
+from creps_jax.policies.learned import Learned
+from creps_jax.policies.space import Space
 from creps_jax.tools.session.plain import shortest
-from creps_jax.tools.session.settings import Context, FeatureSettings, FirstPolicy, Parameter, Settings, ends
+from creps_jax.tools.session.settings import Context, FirstPolicy, Parameter, Settings, ends
 
 V = TypeVar("V", bound=Context)
 
 
-def settings_from_policy(saved: SavedPolicy, *, exploration: float = 1.0) -> Settings:
+def settings_from_policy(learned: Learned, *, exploration: float = 1.0) -> Settings:
     """Return settings that begin with a policy.
 
     Args:
-        saved: the policy; one that was learned without a sigmoid is kept in its bounds by clipping.
+        learned: the policy; one that was learned without a sigmoid is kept in its bounds by clipping.
         exploration: factor of its standard deviations.
 
     Raises:
-        UserError: if that is not positive and finite.
+        UserError: if that is not positive and finite, or the settings of a session cannot name the features.
     """
     if not (exploration > 0 and math.isfinite(exploration)):
         raise UserError(f"exploration must be above zero and finite, got {exploration}")
-    cov_chol = np.float32(exploration) * np.asarray(saved.cov_chol, np.float32)
+    cov_chol = np.float32(exploration) * np.asarray(learned.policy.cov_chol, np.float32)
     return Settings(
-        contexts=_variables(
-            Context, saved.context_names, saved.context_units, saved.context_low, saved.context_high
-        ),
-        parameters=_variables(
-            Parameter, saved.param_names, saved.param_units, saved.param_low, saved.param_high
-        ),
-        features=FeatureSettings(**dataclasses.asdict(saved.features)),
-        constraint="sigmoid" if saved.constraint == "sigmoid" else "clip",
+        contexts=_variables(Context, learned.contexts),
+        parameters=_variables(Parameter, learned.parameters),
+        features=_settings_of_features(learned),
+        constraint="sigmoid" if learned.parameters.constraint == "sigmoid" else "clip",
         first_policy=FirstPolicy(
-            coef=tuple(tuple(shortest(row)) for row in saved.coef),
+            coef=tuple(tuple(shortest(row)) for row in learned.policy.coef),
             cov_chol=tuple(tuple(shortest(row)) for row in cov_chol),
         ),
-        task=dict(saved.task),
+        task=dict(learned.task),
     )
+
+
+def _settings_of_features(learned: Learned) -> Features:
+    """Return the settings that make a policy's features."""
+    low, high = learned.contexts.low, learned.contexts.high
+    described = describe(learned.features)
+    settings = Features("linear")
+    if described["kind"] == "rbf":
+        counts, widths = described["num_centers"], described["width"]
+        settings = Features("rbf", counts[0])
+        if settings.make(low, high) != learned.features:
+            settings = Features("rbf", counts[0], widths[0])
+    if settings.make(low, high) != learned.features:
+        raise UserError(
+            "a session must begin with linear features, or with RBFs over the range of the contexts that "
+            f"have one number of centres and one width, got {described}"
+        )
+    return settings
 
 
 def complete(settings: Settings) -> Settings:
@@ -54,10 +70,7 @@ def complete(settings: Settings) -> Settings:
     Raises:
         UserError: if there are no such features.
     """
-    if settings.features.num_centers is None:
-        num_centers = {1: 5, 2: 3}.get(len(settings.contexts), 2)
-        features = dataclasses.replace(settings.features, num_centers=num_centers)
-        settings = dataclasses.replace(settings, features=features)
+    settings = dataclasses.replace(settings, features=settings.features.complete(len(settings.contexts)))
     if settings.archive_size is None:
         # An update needs as many trials as there are features and parameters.
         least = feature_map(settings).size + len(settings.parameters)
@@ -100,9 +113,9 @@ def first_policy(settings: Settings) -> LinearGaussian:
     return LinearGaussian(jnp.asarray(coef), jnp.asarray(cov_chol))
 
 
-def _variables(kind: type[V], *columns: Sequence[Any]) -> tuple[V, ...]:
-    fields = ("name", "unit", "low", "high")
-    return tuple(kind(**dict(zip(fields, row, strict=True))) for row in zip(*columns, strict=True))
+def _variables(kind: type[V], space: Space) -> tuple[V, ...]:
+    rows = zip(space.names, space.units, space.low, space.high, strict=True)
+    return tuple(kind(name=name, unit=unit, low=low, high=high) for name, unit, low, high in rows)
 
 
 def _start(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
@@ -119,11 +132,6 @@ def _start(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     return coef, np.diag(spread)
 
 
-def features_of(settings: Settings) -> Features:
-    """Return the settings of the features, as policies are saved with."""
-    return Features(**dataclasses.asdict(settings.features))
-
-
 def feature_map(settings: Settings) -> FeatureMap:
     """Return the features of the context.
 
@@ -131,6 +139,14 @@ def feature_map(settings: Settings) -> FeatureMap:
         UserError: if there are no such features.
     """
     try:
-        return features_of(settings).make(*ends(settings.contexts))
+        return settings.features.make(*ends(settings.contexts))
     except ValueError as error:
         raise UserError(str(error)) from error
+
+
+def space_of(variables: Sequence[Context], constraint: str = "none") -> Space:
+    """Return the variables of a session as a policy describes them."""
+    low, high = ends(variables)
+    return Space(
+        tuple(each.name for each in variables), low, high, tuple(each.unit for each in variables), constraint
+    )
