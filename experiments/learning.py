@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
+from creps_jax.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.search.creps import Creps, CrepsState
 from creps_jax.tasks.base import Task
 from creps_jax.training import Samples, train_trials
-from experiments.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
 from experiments.progress import PooledSamples, Progress, Row
 
 _SECONDS_BETWEEN_CHECKPOINTS = 2.0

@@ -37,7 +37,7 @@ import_mjx_quietly()
 import matplotlib.pyplot as plt
 import numpy as np
 
-from creps_jax.policies.learned import load
+import creps_jax as cj
 from creps_jax.tools.play import record
 from creps_jax.tools.plots import PAPER_COLOUR, parameters_against_context
 
@@ -49,15 +49,15 @@ from creps_jax.tools.plots import PAPER_COLOUR, parameters_against_context
 # steps to go faster, then quicker ones. The dotted lines are bounds.
 
 # %%
-policy = load(ROOT / "models" / "nao" / "policies" / "walk.npz")
+policy = cj.load(ROOT / "models" / "nao" / "policies" / "walk.npz")
 speeds = np.linspace(0.1, 0.6, 26)
 parameters_against_context(
     speeds,
     np.stack([policy.theta(speed) for speed in speeds]),
-    names=policy.param_names,
-    units=policy.param_units,
-    low=policy.param_low,
-    high=policy.param_high,
+    names=policy.parameters.names,
+    units=policy.parameters.units,
+    low=policy.parameters.low,
+    high=policy.parameters.high,
     context_label="speed (m/s)",
     title="Ten parameters, one rule",
 )

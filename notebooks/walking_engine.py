@@ -37,7 +37,7 @@ import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 
-from creps_jax.policies.learned import load
+import creps_jax as cj
 from creps_jax.robots.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
 from creps_jax.tools.plots import COLOURS
 from creps_jax.walking.com import spring_height, zmp_of_com
@@ -46,7 +46,7 @@ from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS, params_from_theta
 from creps_jax.walking.zmp import zmp_reference
 
 # %%
-theta = load(ROOT / "models" / "nao" / "policies" / "walk.npz").theta(0.3)
+theta = cj.load(ROOT / "models" / "nao" / "policies" / "walk.npz").theta(0.3)
 print("What the shipped policy answers when asked for .3 m/s:")
 for name, value, unit in zip(PARAM_NAMES, theta, PARAM_UNITS, strict=True):
     print(f"    {name:15} {value:6.3f} {unit}")

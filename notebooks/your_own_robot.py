@@ -36,8 +36,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import creps_jax as cj
+from creps_jax.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 from creps_jax.tools.plots import COLOURS, PAPER_COLOUR
-from experiments.checkpoints import Checkpoint, load_checkpoint, save_checkpoint
 
 # %% [markdown]
 # ## A robot in plain Python

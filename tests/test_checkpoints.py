@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from creps_jax import files
+from creps_jax.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
 from creps_jax.errors import UserError
-from experiments.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
 
 
 class Inner(NamedTuple):
