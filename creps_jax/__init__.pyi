@@ -1,26 +1,36 @@
 from . import numerics, policies, robots, search, simulation, tasks, walking
 from .contexts import context_grid, gaussian_contexts, uniform_contexts
 from .numerics.linalg import thomas_solve
-from .policies.features import FeatureMap, linear_features, quadratic_features, rbf_features
-from .policies.gaussian import LinearGaussian, fit_weighted_ml
+from .policies.base import Policy, WeightedSamples
+from .policies.features import (
+    FeatureMap,
+    linear_features,
+    polynomial_features,
+    quadratic_features,
+    rbf_features,
+)
+from .policies.gaussian import LinearGaussian, fit_weighted_ml, linear_gaussian
 from .policies.learned import Learned, load, save
 from .policies.space import Space, sigmoid_gate
 from .robots.nao_kinematics import leg_fk, leg_ik
 from .search.archive import Archive, Batch
+from .search.base import Search
 from .search.creps import Creps, CrepsInfo, CrepsState, creps
 from .search.dual import DualSolution, sample_weights, solve_dual
-from .search.fit import bounded_ml
+from .search.fit import bounded_ml, weighted_ml
 from .search.importance import Importance
-from .tasks.base import Outcome, Task, average_repeats, penalised, sigmoid_constrained
+from .tasks.base import Outcome, PlainOutcome, Task, average_repeats, penalised, sigmoid_constrained
 from .tasks.planar_arm import hole_reaching, via_point_reaching
 from .tasks.sine import sinus
 from .tasks.walking import nao_walk
 from .training import IterationLog, evaluate, make_iteration, train, train_trials
 from .walking.com import com_trajectory
+from .walking.params import NAO_BOUNDS
 
 __version__: str
 
 __all__ = [
+    "NAO_BOUNDS",
     "Archive",
     "Batch",
     "Creps",
@@ -33,8 +43,12 @@ __all__ = [
     "Learned",
     "LinearGaussian",
     "Outcome",
+    "PlainOutcome",
+    "Policy",
+    "Search",
     "Space",
     "Task",
+    "WeightedSamples",
     "average_repeats",
     "bounded_ml",
     "com_trajectory",
@@ -47,12 +61,14 @@ __all__ = [
     "leg_fk",
     "leg_ik",
     "linear_features",
+    "linear_gaussian",
     "load",
     "make_iteration",
     "nao_walk",
     "numerics",
     "penalised",
     "policies",
+    "polynomial_features",
     "quadratic_features",
     "rbf_features",
     "robots",
@@ -71,4 +87,5 @@ __all__ = [
     "uniform_contexts",
     "via_point_reaching",
     "walking",
+    "weighted_ml",
 ]

@@ -346,7 +346,7 @@ def _checked_argument(name: str, value: Any, kind: Any, arrays: _Arrays) -> Any:
         key(name, value)
     elif "float32" in getattr(kind, "dtypes", ()):
         return _checked_array(name, value, kind.dim_str.split(), arrays)
-    elif all(inspect.isclass(each) and not hasattr(each, "dtypes") for each in kinds):
+    elif all(inspect.isclass(each) and each is not Any and not hasattr(each, "dtypes") for each in kinds):
         instance(name, value, *kinds)
     return value
 
@@ -390,3 +390,11 @@ def _is_number(value: Any) -> bool:
 
 def _is_real(values: np.ndarray | jax.Array) -> bool:
     return any(jnp.issubdtype(values.dtype, kind) for kind in (jnp.floating, jnp.integer, jnp.bool_))
+
+
+def converted(values: Any, dtype: jnp.dtype) -> Any:
+    """Convert an array; what has that type is returned as it is, as even an idle conversion takes time."""
+    if values.dtype == dtype and not getattr(values, "weak_type", False):
+        return values
+    with np.errstate(over="ignore"):  # What is too large for the format becomes infinite: not valid.
+        return values.astype(dtype)

@@ -16,7 +16,6 @@ from jaxtyping import Key, UInt32
 
 from creps_jax import checks
 from creps_jax.keys import threefry
-from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.rollouts import (
     Devices,
     compiled_roll_out,
@@ -28,15 +27,15 @@ from creps_jax.rollouts import (
     share_rows,
     spread_rows,
 )
-from creps_jax.search.archive import Archive, Batch
-from creps_jax.search.creps import Creps, CrepsInfo, CrepsState
+from creps_jax.search.archive import Batch
+from creps_jax.search.base import Search, SearchState
 from creps_jax.tasks.base import Task
-from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar, ScalarLike
+from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
 
 __all__ = ["IterationLog", "Samples", "evaluate", "make_iteration", "train", "train_trials"]
 
-OnIteration = Callable[[CrepsState, "IterationLog"], Any]
-"""Called as (state, log) after an iteration; what it returns is not used."""
+OnIteration = Callable[[Any, "IterationLog"], Any]
+"""Called as (state, log) after an iteration; if it returns True, the run ends there."""
 
 
 class Samples(NamedTuple):
@@ -50,7 +49,8 @@ class Samples(NamedTuple):
 class IterationLog(NamedTuple):
     """What happened in an iteration; only a reader needs it."""
 
-    info: CrepsInfo
+    info: Any
+    """What the search says of its update: `CrepsInfo` of contextual REPS."""
     mean_reward: Scalar
     """Mean reward of the new samples, failed ones included."""
     num_failed: IntScalar
@@ -64,8 +64,8 @@ class IterationLog(NamedTuple):
 
 @checks.arguments
 def make_iteration(
-    task: Task, algorithm: Creps, *, samples: int, devices: Devices = None
-) -> Callable[[PRNGKey, CrepsState], tuple[CrepsState, IterationLog]]:
+    task: Task, algorithm: Search, *, samples: int, devices: Devices = None
+) -> Callable[[PRNGKey, Any], tuple[Any, IterationLog]]:
     """Make one iteration: sample contexts and parameters, roll out, archive, dual, weighted fit.
 
     Args:
@@ -90,9 +90,9 @@ def make_iteration(
     iterate = _program(algorithm, _iterate, setup)
 
     @checks.arguments
-    def iteration(key: PRNGKey, state: CrepsState) -> tuple[CrepsState, IterationLog]:
-        key, state = replicate((key, _checked_state("state", state)), setup.devices)
-        return iterate(key, state)
+    def iteration(key: PRNGKey, state: Any) -> tuple[Any, IterationLog]:
+        _check_state("state", state)
+        return iterate(*replicate((key, state), setup.devices))
 
     return iteration
 
@@ -101,15 +101,15 @@ def make_iteration(
 def train(
     key: PRNGKey,
     task: Task,
-    algorithm: Creps,
-    start: LinearGaussian | CrepsState,
+    algorithm: Search,
+    start: Any,
     *,
     iterations: int,
     samples: int,
     first_samples: int | None = None,
     on_iteration: OnIteration | None = None,
     devices: Devices = None,
-) -> tuple[CrepsState, IterationLog]:
+) -> tuple[Any, IterationLog]:
     """Run iterations of learning, from a first policy or on from a state.
 
     Args:
@@ -121,19 +121,21 @@ def train(
         samples: Number of new samples of each iteration.
         first_samples: Number of new samples of the very first iteration of a run, if it differs.
         on_iteration: Called on the host as (state, log) after each iteration, for progress and
-            checkpoints; this log holds the samples too. Without it all iterations are one `lax.scan`, with
-            the same numbers.
+            checkpoints; this log holds the samples too. If it returns True, the run ends there. Without it
+            all iterations are one `lax.scan`, with the same numbers.
         devices: Devices that share the rollouts, by default all local ones.
 
     Returns:
-        The last state, and the logs stacked along a first axis of `iterations`.
+        The last state, and the logs stacked along a first axis of `iterations`, or of fewer if
+        `on_iteration` ended the run.
 
     Raises:
         ValueError: If an argument is none of what is asked for here, or state, task and features do not fit
             each other.
     """
     _check_callback(on_iteration)
-    state = _checked_start(start) if isinstance(start, CrepsState) else algorithm.init(start)
+    state = start if isinstance(start, SearchState) else algorithm.init(start)
+    algorithm.policy(state)  # Refuses the state of another search.
     phases = _phases(task, state, iterations, samples, first_samples, devices)
     chosen = phases[0][0].devices
     key, state = replicate((key, state), chosen)
@@ -145,15 +147,15 @@ def train(
 def train_trials(
     keys: Key[Array, " trials"] | UInt32[Array, "trials _"],
     task: Task,
-    algorithm: Creps,
-    start: LinearGaussian | CrepsState,
+    algorithm: Search,
+    start: Any,
     *,
     iterations: int,
     samples: int,
     first_samples: int | None = None,
     on_iteration: OnIteration | None = None,
     devices: Devices = None,
-) -> tuple[CrepsState, IterationLog]:
+) -> tuple[Any, IterationLog]:
     """Run several trials of `train` at once.
 
     Devices share the trials where these divide by their number, and otherwise the rollouts of all of them.
@@ -178,15 +180,17 @@ def train_trials(
     """
     num_trials = len(checks.key("keys", keys, num_axes=1))
     _check_callback(on_iteration)
-    if isinstance(start, CrepsState):
-        states = _checked_start(start)
+    if isinstance(start, SearchState):
+        if jnp.shape(start.iteration) != (num_trials,):
+            raise ValueError(
+                f"start must have one state for each of {num_trials} keys, got {jnp.shape(start.iteration)}"
+            )
+        states = start
+        for trial in range(num_trials):
+            algorithm.policy(jax.tree.map(lambda leaf, trial=trial: leaf[trial], states))
     else:
         first = algorithm.init(start)
         states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_trials, *x.shape)), first)
-    if jnp.shape(states.iteration) != (num_trials,):
-        raise ValueError(
-            f"start must have one state for each of {num_trials} keys, got {jnp.shape(states.iteration)}"
-        )
     phases = _phases(task, states, iterations, samples, first_samples, devices)
     setup = phases[0][0]
     if _shares_trials(setup, num_trials):
@@ -245,38 +249,39 @@ class _Setup(NamedTuple):
     devices: tuple[jax.Device, ...]
 
 
-Iterate = Callable[[_Setup, Creps, PRNGKey, CrepsState], tuple[CrepsState, IterationLog]]
+Iterate = Callable[[_Setup, Search, PRNGKey, Any], tuple[Any, IterationLog]]
 
 
-def _program(algorithm: Creps, function: Callable, *static: Any) -> Callable:
+def _program(algorithm: Search, function: Callable, *static: Any) -> Callable:
     """Return `function(*static, algorithm, key, state)`, compiled as (key, state) -> results.
 
-    Programs live as long as the algorithms of the same settings, which share them whatever their KL bounds.
+    Programs live as long as the algorithms that share them.
     """
     programs = algorithm.programs
     if (function, *static) not in programs:
         # A copy: the program must not keep alive the algorithm that keeps it.
-        copy = algorithm.with_kl_bound(np.float32(1))
+        copy = algorithm.with_traced(algorithm.traced)
 
-        def program(kl_bound: ScalarLike, key: Array, state: CrepsState) -> Any:
-            return function(*static, copy.with_kl_bound(kl_bound), key, state)
+        def program(traced: Any, key: Array, state: Any) -> Any:
+            return function(*static, copy.with_traced(traced), key, state)
 
         programs[(function, *static)] = jax.jit(program)
-    kl_bound = np.float32(0) if algorithm.settings is None else algorithm.settings.kl_bound
-    return partial(programs[(function, *static)], kl_bound)
+    return partial(programs[(function, *static)], algorithm.traced)
 
 
-def _iterate(
-    setup: _Setup, algorithm: Creps, key: PRNGKey, state: CrepsState
-) -> tuple[CrepsState, IterationLog]:
+def _iterate(setup: _Setup, algorithm: Search, key: PRNGKey, state: Any) -> tuple[Any, IterationLog]:
     task, samples, devices = setup
-    _check_fit(task, state)
     # The barriers keep the compiler from fusing an iteration with what surrounds it, which rounds
     # differently in a scan and on its own.
     key, state = lax.optimization_barrier((threefry(key), state))
     context_key, theta_key, rollout_key = jax.random.split(jax.random.fold_in(key, state.iteration), 3)
     contexts = jax.vmap(partial(_sample_context, task))(jax.random.split(context_key, samples))
     thetas = algorithm.ask(theta_key, state, contexts)
+    if jnp.shape(thetas) != (samples, task.theta_dim):
+        raise ValueError(
+            f"the search must ask for the task's {task.theta_dim} parameters, "
+            f"got thetas of shape {jnp.shape(thetas)}"
+        )
     outcomes, is_failed = roll_out(task, devices, rollout_key, contexts, thetas)
     state, info = algorithm.tell(state, Batch(contexts, thetas, outcomes.reward))
     log = IterationLog(
@@ -289,9 +294,7 @@ def _iterate(
     return lax.optimization_barrier((state, log))
 
 
-def _iterate_trials(
-    setup: _Setup, algorithm: Creps, keys: Array, states: CrepsState
-) -> tuple[CrepsState, IterationLog]:
+def _iterate_trials(setup: _Setup, algorithm: Search, keys: Array, states: Any) -> tuple[Any, IterationLog]:
     if not _shares_trials(setup, keys.shape[0]):
         return jax.vmap(partial(_iterate, setup, algorithm))(keys, states)
     alone = setup._replace(devices=setup.devices[:1])
@@ -312,9 +315,9 @@ def _shares_trials(setup: _Setup, num_trials: int) -> bool:
 
 
 def _scan(
-    iterate: Iterate, setup: _Setup, length: int, algorithm: Creps, key: Array, state: CrepsState
-) -> tuple[CrepsState, IterationLog]:
-    def step(state: CrepsState, _: None) -> tuple[CrepsState, IterationLog]:
+    iterate: Iterate, setup: _Setup, length: int, algorithm: Search, key: Array, state: Any
+) -> tuple[Any, IterationLog]:
+    def step(state: Any, _: None) -> tuple[Any, IterationLog]:
         state, log = iterate(setup, algorithm, key, state)
         return state, log._replace(samples=None)
 
@@ -323,7 +326,7 @@ def _scan(
 
 def _phases(
     task: Task,
-    state: CrepsState,
+    state: Any,
     iterations: int,
     samples: int,
     first_samples: int | None,
@@ -339,13 +342,13 @@ def _phases(
 
 
 def _run(
-    algorithm: Creps,
+    algorithm: Search,
     iterate: Iterate,
     phases: list[tuple[_Setup, int]],
     key: Array,
-    state: CrepsState,
+    state: Any,
     on_iteration: OnIteration | None,
-) -> tuple[CrepsState, IterationLog]:
+) -> tuple[Any, IterationLog]:
     """Run all phases, as scans or as loops; return the logs on the host, stacked along a first axis."""
     logs = []
     for setup, length in phases:
@@ -358,8 +361,8 @@ def _run(
         for _ in range(length):
             state, log = program(key, state)
             logs.append(jax.tree.map(lambda x: x[None], jax.device_get(log._replace(samples=None))))
-            if on_iteration is not None:
-                on_iteration(state, log)
+            if on_iteration is not None and on_iteration(state, log) is True:
+                return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
     return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
 
 
@@ -368,30 +371,9 @@ def _check_callback(on_iteration: OnIteration | None) -> None:
         checks.function("on_iteration", on_iteration, "(state, log)")
 
 
-def _checked_state(name: str, state: CrepsState) -> CrepsState:
-    """Return a state, its policy as arrays; whether it is of the algorithm, `ask` and `tell` will see."""
-    checks.instance(name, state, CrepsState)
-    checks.instance(f"{name}.policy", state.policy, LinearGaussian)
-    checks.instance(f"{name}.archive", state.archive, Archive)
-    fields = {field: checks.array(f"{name}.policy.{field}", x) for field, x in state.policy._asdict().items()}
-    return state._replace(policy=LinearGaussian(**fields))
-
-
-def _checked_start(start: CrepsState) -> CrepsState:
-    start = _checked_state("start", start)
-    for field, values in start.policy._asdict().items():
-        checks.finite(f"start.policy.{field}", values)
-    return start
-
-
-def _check_fit(task: Task, state: CrepsState) -> None:
-    coef, context = state.policy.coef, state.archive.batch.context
-    if coef.shape[-1:] != (task.theta_dim,):
+def _check_state(name: str, state: Any) -> None:
+    """Refuse what is no state; whether it is one of the search, its functions will see."""
+    if not isinstance(state, SearchState):
         raise ValueError(
-            f"the policy must give the task's {task.theta_dim} parameters, got coef of shape {coef.shape}"
-        )
-    if context.shape[-1:] != (task.context_dim,):
-        raise ValueError(
-            f"the features must take the task's {task.context_dim} context variables, "
-            f"got an archive of shape {context.shape}"
+            f"{name} must be a policy or the state of a search, with iteration, got {checks.shown(state)}"
         )

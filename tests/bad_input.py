@@ -645,6 +645,13 @@ ROWS = {
         mean_kl_bound=number(0.5, above=0.0),
         cov_kl_bound=number(0.05, above=0.0),
     ),
+    "linear_gaussian": row(
+        cj.linear_gaussian,
+        use=lambda _: 0,
+        features=record(FEATURES),
+        m_step=function(weighted_ml),
+        ridge=number(0.1, least=0.0),
+    ),
     "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
     "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),
     "make_iteration": row(

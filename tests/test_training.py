@@ -277,7 +277,7 @@ def test_evaluation_gives_failed_rollouts_the_worst_reward(key):
         ({"devices": 2 * jax.devices()[:1]}, "devices must be given once each, got"),
         (
             {"start": LinearGaussian(np.zeros((2, 3)), np.eye(3))},
-            r"the task's 2 parameters, got coef of shape \(2, 3\)",
+            r"the task's 2 parameters, got thetas of shape \(25, 3\)",
         ),
         ({"start": LinearGaussian(np.zeros((5, 2)), np.eye(2))}, r"coef \(2, d\).*got \(5, 2\)"),
     ],
@@ -291,7 +291,8 @@ def test_refuses_features_of_other_contexts_than_the_task(key):
     algorithm = creps(linear_features(2), quadratic_features(2), archive_size=10)
     start = LinearGaussian(np.zeros((3, 2)), np.eye(2))
     with pytest.raises(
-        ValueError, match=r"the task's 1 context variables, got an archive of shape \(10, 2\)"
+        ValueError,
+        match=r"contexts must have shape \(n, 2\) for features of 2 context variables, got \(3, 1\)",
     ):
         train(key, TASK, algorithm, start, iterations=1, samples=3)
 

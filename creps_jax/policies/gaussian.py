@@ -3,17 +3,35 @@
 Functions take the features of one context; `jax.vmap` them over a batch.
 """
 
+import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.scipy.linalg import solve_triangular
 
 from creps_jax import checks
-from creps_jax.numerics.linalg import exact_dot, safe_cholesky, safe_sqrt
+from creps_jax.numerics.linalg import divided, exact_dot, safe_cholesky, safe_sqrt
+from creps_jax.policies.base import Policy, WeightedSamples
+from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.regression import Regression, as_coefficients, regress
 from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike
 
-__all__ = ["LinearGaussian", "entropy", "fit_weighted_ml", "kl", "log_prob", "mean", "sample"]
+__all__ = [
+    "LinearGaussian",
+    "blended_cov_chol",
+    "checked",
+    "entropy",
+    "fit_weighted_ml",
+    "kl",
+    "linear_gaussian",
+    "log_prob",
+    "mean",
+    "sample",
+]
 
 _LOG_TWO_PI = 1.8378770664093453
 
@@ -84,7 +102,7 @@ def log_prob(policy: LinearGaussian, features: Float[Array, " p"], theta: Float[
     centre = mean(policy, features)
     if theta.shape != centre.shape:
         raise ValueError(f"theta has to have shape {centre.shape}, got {theta.shape}")
-    whitened = jax.scipy.linalg.solve_triangular(policy.cov_chol, theta - centre, lower=True)
+    whitened = solve_triangular(policy.cov_chol, theta - centre, lower=True)
     return -0.5 * jnp.sum(whitened**2) - _half_log_det(policy) - 0.5 * _LOG_TWO_PI * centre.size
 
 
@@ -106,7 +124,7 @@ def kl(policy: LinearGaussian, reference: LinearGaussian, features: Float[Array,
         raise ValueError(f"policies differ in shape: {policy.coef.shape} and {reference.coef.shape}")
     shift = mean(policy, features) - mean(reference, features)
     both = jnp.concatenate([policy.cov_chol, shift[:, None]], axis=1)
-    ratio = jax.scipy.linalg.solve_triangular(reference.cov_chol, both, lower=True)
+    ratio = solve_triangular(reference.cov_chol, both, lower=True)
     log_dets = _half_log_det(reference) - _half_log_det(policy)
     return 0.5 * (jnp.sum(ratio**2) - shift.size) + log_dets
 
@@ -172,6 +190,139 @@ def _weighted_cov_chol(fit: Regression) -> Float[Array, "d d"]:
     correlation = scatter / (spread[:, None] * spread[None, :])
     is_diagonal = jnp.eye(spread.size, dtype=bool)
     return spread[:, None] * safe_cholesky(jnp.where(is_diagonal, 1.0, correlation))
+
+
+def linear_gaussian(
+    features: FeatureMap, *, m_step: Callable[..., LinearGaussian], ridge: float | int = 1e-4
+) -> Policy:
+    """Make the kind of policy whose states are `LinearGaussian`s.
+
+    Args:
+        features: Features varphi(s) that the mean is linear in.
+        m_step: How it is fitted to weighted samples, `(old policy, samples, *, ridge, scale) -> new policy`.
+        ridge: Penalty on the coefficients, relative to the square of each feature's scale.
+
+    Returns:
+        The record of its functions. Those of equal settings are equal.
+
+    Raises:
+        ValueError: If the ridge is negative or no number, or the m_step is no function.
+    """
+    checks.instance("features", features, FeatureMap)
+    checks.number("ridge", ridge, least=0.0)
+    checks.function("m_step", m_step, "(policy, samples, *, ridge, scale) -> policy")
+    return Policy(
+        features,
+        mean=_mean_rows,
+        sample=_sample_rows,
+        log_prob=_log_prob_rows,
+        kl=_kl_rows,
+        entropy=entropy,
+        fit=_Fit(m_step, ridge, features.scale),
+        blend=_blend,
+        noise=_whitened,
+        checked=checked,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    """Fit a policy with the settings of `linear_gaussian`."""
+
+    m_step: Callable[..., LinearGaussian]
+    ridge: float | int
+    scale: tuple[float, ...] | None
+
+    def __call__(self, policy: LinearGaussian, samples: WeightedSamples) -> LinearGaussian:
+        scale = None if self.scale is None else jnp.asarray(self.scale, samples.theta.dtype)
+        fitted = self.m_step(policy, samples, ridge=self.ridge, scale=scale)
+        checks.instance("what m_step returns", fitted, LinearGaussian)
+        for field, values in policy._asdict().items():
+            checks.array(f"{field} of what m_step returns", getattr(fitted, field), values.shape)
+        return fitted
+
+
+def _mean_rows(policy: LinearGaussian, features: Array) -> Array:
+    return jax.vmap(mean, (None, 0))(policy, features)
+
+
+def _sample_rows(key: PRNGKey, policy: LinearGaussian, features: Array) -> Array:
+    keys = jax.random.split(key, features.shape[0])
+    return jax.vmap(sample, (0, None, 0))(keys, policy, features)
+
+
+def _log_prob_rows(policy: LinearGaussian, features: Array, theta: Array) -> Array:
+    whitened = _whitened(policy, features, theta)
+    constant = _half_log_det(policy) + 0.5 * _LOG_TWO_PI * theta.shape[1]
+    return -0.5 * jnp.sum(whitened**2, axis=1) - constant
+
+
+def _kl_rows(policy: LinearGaussian, reference: LinearGaussian, features: Array) -> Array:
+    # Only the shift of the mean depends on the context.
+    without_shift = kl(policy, reference, jnp.zeros_like(features[0]))
+    shifts = exact_dot(features, divided(policy.coef - reference.coef, reference.cov_chol.T))
+    return without_shift + 0.5 * jnp.sum(shifts**2, axis=1)
+
+
+def _whitened(policy: LinearGaussian, features: Array, theta: Array) -> Array:
+    """Return what theta differs from the mean by, in units of the covariance's root."""
+    # One small inverse and a product: a triangular system for each sample takes many times as long.
+    inverse = divided(jnp.eye(theta.shape[1], dtype=theta.dtype), policy.cov_chol.T)
+    return exact_dot(theta - exact_dot(features, policy.coef), inverse)
+
+
+def _blend(old: LinearGaussian, fitted: LinearGaussian, share: Scalar) -> LinearGaussian:
+    return fitted._replace(cov_chol=blended_cov_chol(old.cov_chol, fitted.cov_chol, share))
+
+
+def blended_cov_chol(
+    old: Float[Array, "d d"], new: Float[Array, "d d"], share: ScalarLike
+) -> Float[Array, "d d"]:
+    """Return the Cholesky factor of `(1 - share) old old' + share new new'`, exactly if the share is 0 or 1.
+
+    The relative entropy to the old covariance is convex in the new one: the blend keeps its bounds.
+    """
+    share = jnp.asarray(share, new.dtype)
+    # In units of the old one nothing is lost to the squares of small spreads.
+    change = solve_triangular(old, new, lower=True)
+    blend = (1.0 - share) * jnp.eye(old.shape[0], dtype=new.dtype) + share * exact_dot(change, change.T)
+    is_between = (share > 0.0) & (share < 1.0)
+    factor = jnp.linalg.cholesky(jnp.where(is_between, blend, jnp.eye(old.shape[0], dtype=new.dtype)))
+    return jnp.where(share >= 1.0, new, jnp.where(share <= 0.0, old, jnp.tril(exact_dot(old, factor))))
+
+
+def checked(name: str, policy: LinearGaussian, features: FeatureMap) -> LinearGaussian:
+    """Return a policy in one precision, after checking that it fits the features.
+
+    Raises:
+        ValueError: If it does not, is not finite, or `cov_chol` is no Cholesky factor.
+    """
+    checks.instance(name, policy, LinearGaussian)
+    coef, cov_chol = (
+        checks.array(f"{name}.coef", policy.coef),
+        checks.array(f"{name}.cov_chol", policy.cov_chol),
+    )
+    if (
+        coef.ndim != 2
+        or coef.shape[0] != features.size
+        or 0 in coef.shape
+        or cov_chol.shape != (coef.shape[1],) * 2
+    ):
+        raise ValueError(
+            f"the {name} must have coef ({features.size}, d), a row for each of the policy features, "
+            f"and cov_chol (d, d), got {coef.shape} and {cov_chol.shape}"
+        )
+    dtype = jnp.promote_types(coef.dtype, cov_chol.dtype)
+    policy = LinearGaussian(checks.converted(coef, dtype), checks.converted(cov_chol, dtype))
+    for field, values in policy._asdict().items():
+        checks.finite(f"{name}.{field}", values)
+    if not isinstance(policy.cov_chol, Tracer):
+        upper, diagonal = np.triu(policy.cov_chol, 1), np.diagonal(policy.cov_chol)
+        if upper.any():
+            entry = upper[upper != 0][0]
+            raise ValueError(f"{name}.cov_chol must be lower triangular, got {entry} above its diagonal")
+        checks.finite(f"the diagonal of {name}.cov_chol", diagonal, above=0.0)
+    return policy
 
 
 def _half_log_det(policy: LinearGaussian) -> Array:

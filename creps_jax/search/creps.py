@@ -20,16 +20,16 @@ from jax.typing import ArrayLike
 
 from creps_jax import checks
 from creps_jax.keys import threefry
-from creps_jax.numerics.linalg import divided, exact_dot
-from creps_jax.policies import gaussian
+from creps_jax.policies.base import Policy, WeightedSamples
 from creps_jax.policies.features import FeatureMap
-from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian, linear_gaussian
 from creps_jax.programs import KeepsPrograms
 from creps_jax.search.archive import Archive, Batch, centred_reward, empty_archive, push, split_reward
+from creps_jax.search.base import Search
 from creps_jax.search.dual import DualSolution, sample_kl, solve_and_weigh
-from creps_jax.search.evidence import blended_cov_chol, independence_p_value, share_of_evidence
-from creps_jax.search.fit import MStep, WeightedSamples, bounded_ml, weighted_ml
-from creps_jax.search.importance import Importance, PolicyHistory, empty_history, importance_weights, remember
+from creps_jax.search.evidence import independence_p_value, share_of_evidence
+from creps_jax.search.fit import MStep, bounded_ml, weighted_ml
+from creps_jax.search.importance import Importance, empty_history, importance_weights, remember
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar, ScalarLike
 
 __all__ = ["Creps", "CrepsInfo", "CrepsSettings", "CrepsState", "creps"]
@@ -46,11 +46,12 @@ _COARSE_REWARDS = 1e-3
 class CrepsState(NamedTuple):
     """What the next step needs: all of it, so that a saved state resumes a run exactly."""
 
-    policy: LinearGaussian
+    policy: Any
+    """A `LinearGaussian`, unless `creps` was given another kind of policy."""
     archive: Archive
     iteration: IntScalar
     """How many batches have been told."""
-    history: PolicyHistory | None = None
+    history: Any = None
     """The policies that archived samples were drawn from; None where all samples count equally."""
 
 
@@ -93,40 +94,29 @@ class CrepsInfo(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Creps(KeepsPrograms):
-    """The algorithm as a record of pure functions, closed over and never traced.
+class Creps(Search):
+    """Contextual REPS as a record of pure functions, see `Search`.
 
-    All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters. They are
-    the methods of `CrepsSettings`, which say more. Algorithms of equal settings share compiled programs,
-    whatever their KL bounds, and the last one frees them. An algorithm whose features and M-step are data, as
-    those of this library are, can be pickled.
+    They are the methods of `CrepsSettings`, which say more. Algorithms of equal settings share compiled
+    programs, whatever their KL bounds, and the last one frees them. An algorithm whose features and M-step
+    are data, as those of this library are, can be pickled.
 
     Attributes:
-        init: (policy) -> state, with an empty archive.
-        ask: (key, state, contexts (n, s)) -> thetas (n, d), drawn from the policy.
-        tell: (state, batch) -> (state, info): archive the batch, fit a new policy to the archive.
-        mean: (policy, contexts (n, s)) -> thetas (n, d), the policy without its exploration.
+        mean: (policy or state, contexts (n, s)) -> thetas (n, d), the policy without its exploration.
     """
 
-    init: Callable[[LinearGaussian], CrepsState]
-    ask: Callable[[PRNGKey, CrepsState, ArrayLike], Array]
-    tell: Callable[[CrepsState, Batch], tuple[CrepsState, CrepsInfo]]
-    mean: Callable[[LinearGaussian, ArrayLike], Array]
+    mean: Callable[[Any, ArrayLike], Array]
 
     def __post_init__(self) -> None:
         """Check the functions."""
-        for name, arguments in (
-            ("init", "(policy)"),
-            ("ask", "(key, state, contexts)"),
-            ("tell", "(state, batch)"),
-            ("mean", "(policy, contexts)"),
-        ):
-            checks.function(name, getattr(self, name), arguments)
+        super().__post_init__()
+        checks.function("mean", self.mean, "(policy, contexts)")
 
     @functools.cached_property
     def settings(self) -> "CrepsSettings | None":
-        """The settings that all four functions are of; None where one of them is a user's own."""
-        owners = [getattr(function, "__self__", None) for function in self._functions]
+        """The settings that all functions are of; None where one of them is a user's own."""
+        functions = (self.init, self.ask, self.tell, self.policy, self.mean)
+        owners = [getattr(function, "__self__", None) for function in functions]
         is_one = all(owner is owners[0] for owner in owners)
         return owners[0] if is_one and isinstance(owners[0], CrepsSettings) else None
 
@@ -134,6 +124,17 @@ class Creps(KeepsPrograms):
     def programs(self) -> dict[Any, Any]:
         """Compiled programs that are made of this algorithm, such as iterations."""
         return {} if self.settings is None else self.settings.programs.others
+
+    @property
+    def traced(self) -> Any:
+        """The KL bound."""
+        return np.float32(0) if self.settings is None else self.settings.kl_bound
+
+    def with_traced(self, traced: Any) -> "Creps":
+        """Return the algorithm with another KL bound; one with a function of a user's own has none."""
+        if self.settings is None:
+            return dataclasses.replace(self)
+        return dataclasses.replace(self.settings, kl_bound=_checked_kl_bound(traced)).algorithm()
 
     def with_kl_bound(self, kl_bound: ScalarLike) -> "Creps":
         """Return the algorithm with another KL bound, for which nothing is compiled anew.
@@ -146,25 +147,17 @@ class Creps(KeepsPrograms):
         Raises:
             ValueError: If the bound is not a number above 0.
         """
-        if self.settings is None:
-            return dataclasses.replace(self)
-        return dataclasses.replace(self.settings, kl_bound=_checked_kl_bound(kl_bound)).algorithm()
-
-    @property
-    def _functions(self) -> tuple[Callable, ...]:
-        return self.init, self.ask, self.tell, self.mean
+        return self.with_traced(kl_bound)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CrepsSettings(KeepsPrograms):
     """The settings of the algorithm as data, see `creps`, and the functions of `Creps` as methods."""
 
-    policy_features: FeatureMap
+    kind: Policy
     baseline_features: FeatureMap
     kl_bound: ScalarLike
     archive_size: int
-    ridge: float | int
-    m_step: MStep
     importance: Importance | None
     significance: float | int | None
 
@@ -172,13 +165,13 @@ class CrepsSettings(KeepsPrograms):
         """Return the functions."""
         # Now, while an algorithm that they may be shared with is alive: one that this one takes the place of.
         _ = self.programs
-        return Creps(self.init, self.ask, self.tell, self.mean)
+        return Creps(self.init, self.ask, self.tell, self.policy, self.mean)
 
-    def init(self, policy: LinearGaussian) -> CrepsState:
+    def init(self, policy: Any) -> CrepsState:
         """Begin with a policy and an empty archive, both in the precision of the policy.
 
         Args:
-            policy: The first policy.
+            policy: The first policy, a `LinearGaussian` unless `creps` was given another kind.
 
         Returns:
             The state.
@@ -191,14 +184,15 @@ class CrepsSettings(KeepsPrograms):
         Warns:
             UserWarning: If the archive is too small for fits that can be trusted.
         """
-        policy = _checked_policy("policy", policy, self.policy_features)
-        for field, values in policy._asdict().items():
-            # Coefficients are multiplied by features, which may be small; squares are taken of the spread.
-            checks.finite(f"policy.{field}", values, largest=_LARGEST[field])
-        theta_dim = policy.coef.shape[1]
+        policy = self._checked_policy("policy", policy)
+        if isinstance(policy, LinearGaussian):
+            for field, values in policy._asdict().items():
+                # Coefficients are multiplied by small features; squares are taken of the spread.
+                checks.finite(f"policy.{field}", values, largest=_LARGEST[field])
+        theta_dim = self._theta_dim(policy)
         self._check_archive_size(theta_dim)
         archive = empty_archive(
-            self.archive_size, self.policy_features.context_dim, theta_dim, policy.coef.dtype
+            self.archive_size, self.kind.features.context_dim, theta_dim, _precision(policy)
         )
         importance = self.importance
         history = None if importance is None else empty_history(policy, importance.num_policies)
@@ -251,13 +245,22 @@ class CrepsSettings(KeepsPrograms):
         state = state._replace(archive=archive)
         return self.programs.update(self.kl_bound, state)
 
-    def mean(self, policy: LinearGaussian, contexts: ArrayLike) -> Array:
-        """Return the parameters theta (n, d) of contexts (n, s) under the policy without its exploration.
+    def policy(self, state: CrepsState) -> Any:
+        """Return the policy of a state."""
+        return self._checked_state(state).policy
+
+    def mean(self, policy: Any, contexts: ArrayLike) -> Array:
+        """Return the parameters theta (n, d) of contexts (n, s) under a policy without its exploration.
+
+        Args:
+            policy: A policy, or a state: its policy.
+            contexts: Contexts (n, s).
 
         Raises:
             ValueError: As `ask` does.
         """
-        policy = _checked_policy("policy", policy, self.policy_features)
+        policy = policy.policy if isinstance(policy, CrepsState) else policy
+        policy = self._checked_policy("policy", policy)
         contexts = self._checked_contexts(contexts, policy)
         return self._checked_thetas(contexts, *self.programs.mean(policy, contexts))
 
@@ -275,7 +278,7 @@ class CrepsSettings(KeepsPrograms):
         return found
 
     def _check_archive_size(self, theta_dim: int) -> None:
-        num_fitted, num_baseline = self.policy_features.size + theta_dim, self.baseline_features.size
+        num_fitted, num_baseline = self.kind.features.size + theta_dim, self.baseline_features.size
         if self.archive_size < num_fitted:
             raise ValueError(
                 f"archive_size must be at least {num_fitted}, features and parameters, "
@@ -290,20 +293,31 @@ class CrepsSettings(KeepsPrograms):
         if self.archive_size < enough:
             warnings.warn(
                 f"archive_size should be at least {enough}, {_ENOUGH_SAMPLES} samples for each of "
-                f"{self.policy_features.size} features and {theta_dim} parameters, or of {num_baseline} "
+                f"{self.kind.features.size} features and {theta_dim} parameters, or of {num_baseline} "
                 f"baseline features, got {self.archive_size}: the policy will hardly move, or move by chance",
                 stacklevel=3,
             )
 
-    def _checked_contexts(self, contexts: ArrayLike, policy: LinearGaussian) -> Array:
-        shape = ("n", self.policy_features.context_dim)
-        contexts = checks.array("contexts", contexts, shape)
-        return checks.finite("contexts", _converted(contexts, policy.coef.dtype))
+    def _checked_policy(self, name: str, policy: Any) -> Any:
+        """Return a policy in one precision, after checking that it is one of this kind."""
+        if self.kind.checked is not None:
+            return self.kind.checked(name, policy, self.kind.features)
+        return jax.tree.map(lambda leaf: checks.finite(name, checks.array(name, leaf)), policy)
+
+    def _theta_dim(self, policy: Any) -> int:
+        features = jnp.zeros((1, self.kind.features.size), _precision(policy))
+        return jax.eval_shape(self.kind.mean, policy, features).shape[1]
+
+    def _checked_contexts(self, contexts: ArrayLike, policy: Any) -> Array:
+        shape = ("n", self.kind.features.context_dim)
+        note = f" for features of {shape[1]} context variables"
+        contexts = checks.array("contexts", contexts, shape, note=note)
+        return checks.finite("contexts", checks.converted(contexts, _precision(policy)))
 
     def _checked_thetas(self, contexts: Array, thetas: Array, is_finite: Array) -> Array:
         if not isinstance(is_finite, Tracer) and not np.all(is_finite):
             context = np.asarray(contexts)[~np.asarray(is_finite)][0]
-            features = np.asarray(self.policy_features.apply(jnp.asarray(context)))
+            features = np.asarray(self.kind.features.apply(jnp.asarray(context)))
             raise ValueError(
                 f"policy_features.apply(context) must be finite, got {features} for context {context}"
             )
@@ -312,7 +326,7 @@ class CrepsSettings(KeepsPrograms):
     def _checked_state(self, state: CrepsState) -> CrepsState:
         """Return a state after checking that it is one of this algorithm."""
         checks.instance("state", state, CrepsState)
-        policy = _checked_policy("state.policy", state.policy, self.policy_features)
+        policy = self._checked_policy("state.policy", state.policy)
         checks.instance("state.archive", state.archive, Archive)
         context, theta, reward = state.archive.batch
         if jnp.shape(reward) != (self.archive_size,):
@@ -320,10 +334,10 @@ class CrepsSettings(KeepsPrograms):
                 f"state.archive must have the {self.archive_size} slots of archive_size, "
                 f"got {jnp.shape(reward)}"
             )
-        checks.array("state.archive.batch.context", context, ("L", self.policy_features.context_dim))
-        checks.array("state.archive.batch.theta", theta, ("L", policy.coef.shape[1]))
+        checks.array("state.archive.batch.context", context, ("L", self.kind.features.context_dim))
+        checks.array("state.archive.batch.theta", theta, ("L", self._theta_dim(policy)))
         expected = 0 if self.importance is None else self.importance.num_policies
-        got = 0 if state.history is None else state.history.coef.shape[0]
+        got = 0 if state.history is None else jnp.shape(jax.tree.leaves(state.history)[0])[0]
         if got != expected:
             raise ValueError(
                 f"the state must hold the last {expected} policies, as `init` makes it, got {got}"
@@ -349,29 +363,32 @@ _PROGRAMS: weakref.WeakValueDictionary[tuple, Programs] = weakref.WeakValueDicti
 
 @checks.arguments
 def creps(
-    policy_features: FeatureMap,
-    baseline_features: FeatureMap,
+    policy_features: FeatureMap | Policy,
+    baseline_features: FeatureMap | None = None,
     *,
     kl_bound: ScalarLike = 0.5,
     archive_size: int,
-    ridge: float | int = 1e-4,
-    m_step: MStep = weighted_ml,
+    ridge: float | int | None = None,
+    m_step: MStep | None = None,
     importance: Importance | None = None,
     significance: float | int | None = 0.1,
 ) -> Creps:
     """Set up contextual relative entropy policy search.
 
     Args:
-        policy_features: Features varphi(s) that the policy's mean is linear in.
-        baseline_features: Features phi(s) whose expectations over the contexts are kept.
+        policy_features: Features varphi(s) that the mean of a Gaussian policy is linear in; or another kind
+            of policy, see `Policy`.
+        baseline_features: Features phi(s) whose expectations over the contexts are kept; by default those of
+            the policy.
         kl_bound: Largest relative entropy epsilon of one update, in nats. Another value compiles nothing
             anew. Inside `jit`, where it cannot be checked, a bound that is not above 0 keeps the policy.
         archive_size: Number L of the last samples that are learned from. There should be two for each feature
             and each parameter, and two for each baseline feature: `init` warns of fewer, and refuses less
             than one, or as few as could all be explained by the baseline.
-        ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale.
-        m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's, goes wherever
-            they lead; `bounded_ml()` keeps mean and covariance from moving too far at once.
+        ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale; 1e-4 by
+            default.
+        m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's and the default,
+            goes wherever they lead; `bounded_ml()` bounds how far mean and covariance move in an update.
         importance: Weigh archived samples by how likely they are today over how likely they were when drawn
             (`Importance()`); by default all count equally, as in the paper. The weights are those of samples
             that were drawn by `ask`.
@@ -387,40 +404,60 @@ def creps(
 
     Source: Abdolmaleki et al. 2016, Section 3.1.
     """
-    _check_settings(policy_features, baseline_features, ridge, significance)
     kl_bound = _checked_kl_bound(kl_bound)
-    checks.function("m_step", m_step, "(policy, samples, *, ridge, scale) -> policy")
-    if m_step is bounded_ml:
+    if significance is not None and not 0 < checks.number("significance", significance) <= 1:
+        raise ValueError(f"significance must be above 0 and at most 1, or None, got {significance}")
+    kind = _kind(policy_features, ridge, m_step)
+    baseline_features = kind.features if baseline_features is None else baseline_features
+    _check_features("policy_features", kind.features)
+    _check_features("baseline_features", baseline_features)
+    if kind.features.context_dim != baseline_features.context_dim:
         raise ValueError(
-            "m_step must be an M-step, such as bounded_ml(), got bounded_ml without its parentheses"
+            "policy_features and baseline_features must be of the same context, got "
+            f"{kind.features.context_dim} and {baseline_features.context_dim} variables"
+        )
+    if significance is not None and kind.blend is None:
+        raise ValueError(
+            f"significance must be None for a policy that has no function blend, got {significance}"
         )
     settings = CrepsSettings(
-        policy_features=policy_features,
+        kind=kind,
         baseline_features=baseline_features,
         kl_bound=kl_bound,
         archive_size=archive_size,
-        ridge=ridge,
-        m_step=m_step,
         importance=importance,
         significance=significance,
     )
     return settings.algorithm()
 
 
+def _kind(given: FeatureMap | Policy, ridge: float | int | None, m_step: MStep | None) -> Policy:
+    """Return the kind of policy, by default a Gaussian one with these settings of its fit."""
+    if isinstance(given, Policy):
+        if ridge is not None or m_step is not None:
+            raise ValueError(f"ridge and m_step must be None for a Policy, got {ridge} and {m_step}")
+        return given
+    m_step = weighted_ml if m_step is None else m_step
+    if m_step is bounded_ml:
+        raise ValueError(
+            "m_step must be an M-step, such as bounded_ml(), got bounded_ml without its parentheses"
+        )
+    return linear_gaussian(given, m_step=m_step, ridge=1e-4 if ridge is None else ridge)
+
+
 def _ask(
-    settings: CrepsSettings, key: PRNGKey, policy: LinearGaussian, contexts: Array
+    settings: CrepsSettings, key: PRNGKey, policy: Any, contexts: Array
 ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
     """Draw parameters, and tell where features are finite."""
-    keys = jax.random.split(key, contexts.shape[0])
-    features = _features_of("policy_features", settings.policy_features, contexts)
-    return jax.vmap(gaussian.sample, (0, None, 0))(keys, policy, features), _are_finite(features)
+    features = _features_of("policy_features", settings.kind.features, contexts)
+    return settings.kind.sample(key, policy, features), _are_finite(features)
 
 
 def _mean(
-    settings: CrepsSettings, policy: LinearGaussian, contexts: Array
+    settings: CrepsSettings, policy: Any, contexts: Array
 ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
-    features = _features_of("policy_features", settings.policy_features, contexts)
-    return jax.vmap(gaussian.mean, (None, 0))(policy, features), _are_finite(features)
+    features = _features_of("policy_features", settings.kind.features, contexts)
+    return settings.kind.mean(policy, features), _are_finite(features)
 
 
 class _Samples(NamedTuple):
@@ -441,30 +478,25 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
     features, baseline, theta, reward, resolution, prior, is_valid = samples
     given = reward, baseline, prior
     dual, weights = solve_and_weigh(*given, kl_bound=kl_bound, resolution=resolution)  # Eq. 13
-    weighted = WeightedSamples(features, theta, weights, is_valid)
-    scale = settings.policy_features.scale
-    scale = None if scale is None else jnp.asarray(scale, theta.dtype)
-    fitted = settings.m_step(state.policy, weighted, ridge=settings.ridge, scale=scale)  # Eq. 14, 15
-    _check_fitted(fitted, state.policy)
+    kind, old = settings.kind, state.policy
+    fitted = kind.fit(old, WeightedSamples(features, theta, weights, is_valid))  # Eq. 14, 15
 
-    inverse = divided(jnp.eye(theta.shape[1], dtype=theta.dtype), state.policy.cov_chol.T)
-    noise = exact_dot(theta - exact_dot(features, state.policy.coef), inverse)
+    noise = theta - kind.mean(old, features) if kind.noise is None else kind.noise(old, features, theta)
     p_value = independence_p_value(weights, prior, features, noise)
-    if settings.significance is not None:
-        share = share_of_evidence(p_value, settings.significance)
-        cov_chol = blended_cov_chol(state.policy.cov_chol, fitted.cov_chol, share)
-        fitted = fitted._replace(cov_chol=cov_chol)
+    if settings.significance is not None and kind.blend is not None:
+        fitted = kind.blend(old, fitted, share_of_evidence(p_value, settings.significance))
 
     num_valid = jnp.sum(is_valid, dtype=jnp.int32)
-    is_updated = _is_usable(fitted) & (num_valid >= sum(state.policy.coef.shape)) & dual.is_informative
-    policy = jax.tree.map(lambda new, old: jnp.where(is_updated, new, old), fitted, state.policy)
-    entropy = gaussian.entropy(policy)
-    loss = jnp.maximum(gaussian.entropy(state.policy) - entropy, 0.0)
+    num_fitted = features.shape[1] + theta.shape[1]
+    is_updated = _is_usable(kind, fitted) & (num_valid >= num_fitted) & dual.is_informative
+    policy = jax.tree.map(lambda new, old: jnp.where(is_updated, new, old), fitted, old)
+    entropy = kind.entropy(policy)
+    loss = jnp.maximum(kind.entropy(old) - entropy, 0.0)
     spread = jnp.max(jnp.abs(reward))
     info = CrepsInfo(
         dual=dual,
         kl=sample_kl(weights, prior),
-        policy_kl=jnp.where(is_updated, _mean_kl(policy, state.policy, features, is_valid), 0.0),
+        policy_kl=jnp.where(is_updated, _mean_over(kind.kl(policy, old, features), is_valid), 0.0),
         effective_samples=_effective_samples(weights),
         prior_effective_samples=_effective_samples(prior),
         entropy=entropy,
@@ -486,11 +518,11 @@ def _share_by_chance(p_value: Scalar, significance: float | int | None) -> Scala
     return 2.0 * p_value if significance is None else 3.0 * jnp.minimum(p_value / significance, 1.0)
 
 
-def _samples(settings: CrepsSettings, state: CrepsState) -> tuple[_Samples, PolicyHistory | None]:
+def _samples(settings: CrepsSettings, state: CrepsState) -> tuple[_Samples, Any]:
     """Return what an update is made from, and the history with the policy of this iteration."""
     archive = state.archive
     context, theta, _ = archive.batch
-    features = _features_of("policy_features", settings.policy_features, context)
+    features = _features_of("policy_features", settings.kind.features, context)
     baseline = _features_of("baseline_features", settings.baseline_features, context)
     is_valid = archive.is_valid & _are_finite(features) & _are_finite(baseline)
     if settings.importance is not None:
@@ -498,38 +530,48 @@ def _samples(settings: CrepsSettings, state: CrepsState) -> tuple[_Samples, Poli
     archive = archive._replace(is_valid=is_valid)
     # What is left out must not enter: 0 * nan is not 0.
     features, theta, baseline = (jnp.where(is_valid[:, None], x, 0.0) for x in (features, theta, baseline))
-    prior, history = _prior(settings.importance, state, archive, features)
+    prior, history = _prior(settings, state, archive, features)
     reward, resolution = centred_reward(archive)
     return _Samples(features, baseline, theta, reward, resolution, prior, is_valid), history
 
 
 def _prior(
-    importance: Importance | None, state: CrepsState, archive: Archive, features: Array
-) -> tuple[Array, PolicyHistory | None]:
+    settings: CrepsSettings, state: CrepsState, archive: Archive, features: Array
+) -> tuple[Array, Any]:
     """Return how much each sample counts before rewards are looked at, and the history with this policy."""
     is_valid, theta = archive.is_valid, archive.batch.theta
-    if importance is None or state.history is None:
+    if settings.importance is None or state.history is None:
         return is_valid.astype(theta.dtype), None
     policy, iteration = state.policy, state.iteration
     history = remember(state.history, policy, iteration)
-    least = importance.least_effective
     weights = importance_weights(
-        policy, history, features, theta, archive.age, is_valid, iteration, least_effective=least
+        settings.kind.log_prob,
+        policy,
+        history,
+        features,
+        theta,
+        archive.age,
+        is_valid,
+        iteration,
+        least_effective=settings.importance.least_effective,
     )
     return weights, history
 
 
-def _is_usable(policy: LinearGaussian) -> Bool[Array, ""]:
-    is_finite = jnp.all(jnp.isfinite(policy.coef)) & jnp.all(jnp.isfinite(policy.cov_chol))
-    return is_finite & jnp.all(jnp.diagonal(policy.cov_chol) > 0)
+def _is_usable(kind: Policy, policy: Any) -> Bool[Array, ""]:
+    # The entropy of a Gaussian whose spread is not positive is none.
+    leaves = [*jax.tree.leaves(policy), kind.entropy(policy)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
 
 
-def _mean_kl(policy: LinearGaussian, reference: LinearGaussian, features: Array, is_valid: Array) -> Scalar:
-    """Average `policy.kl` over contexts; only the shift of the mean depends on the context."""
-    without_shift = gaussian.kl(policy, reference, jnp.zeros_like(features[0]))
-    shifts = exact_dot(features, divided(policy.coef - reference.coef, reference.cov_chol.T))
-    count = jnp.maximum(jnp.sum(is_valid, dtype=shifts.dtype), 1.0)
-    return without_shift + 0.5 * jnp.sum(shifts**2, where=is_valid[:, None]) / count
+def _mean_over(values: Array, is_valid: Array) -> Scalar:
+    count = jnp.maximum(jnp.sum(is_valid, dtype=values.dtype), 1.0)
+    return jnp.sum(values, where=is_valid) / count
+
+
+def _precision(policy: Any) -> Any:
+    """Return the precision of a policy's arrays."""
+    return jnp.result_type(*jax.tree.leaves(policy))
 
 
 def _effective_samples(weights: Array) -> Scalar:
@@ -540,51 +582,13 @@ def _effective_samples(weights: Array) -> Scalar:
 def _features_of(name: str, features: FeatureMap, contexts: Array) -> Array:
     def apply(context: Array) -> Array:
         values = checks.array(f"{name}.apply(context)", features.apply(context), (features.size,))
-        return _converted(values, contexts.dtype)
+        return checks.converted(values, contexts.dtype)
 
     return jax.vmap(apply)(contexts)
 
 
 def _are_finite(rows: Array) -> Bool[Array, " n"]:
     return jnp.all(jnp.isfinite(rows), axis=1)
-
-
-def _converted(values: Any, dtype: jnp.dtype) -> Any:
-    """Convert an array; what has that type is returned as it is, as even an idle conversion takes time."""
-    if values.dtype == dtype and not getattr(values, "weak_type", False):
-        return values
-    with np.errstate(over="ignore"):  # What is too large for the format becomes infinite: not valid.
-        return values.astype(dtype)
-
-
-def _checked_policy(name: str, policy: LinearGaussian, features: FeatureMap) -> LinearGaussian:
-    """Return a policy in one precision, after checking that it fits the features."""
-    checks.instance(name, policy, LinearGaussian)
-    coef, cov_chol = (
-        checks.array(f"{name}.coef", policy.coef),
-        checks.array(f"{name}.cov_chol", policy.cov_chol),
-    )
-    if (
-        coef.ndim != 2
-        or coef.shape[0] != features.size
-        or 0 in coef.shape
-        or cov_chol.shape != (coef.shape[1],) * 2
-    ):
-        raise ValueError(
-            f"the {name} must have coef ({features.size}, d), a row for each of the policy features, "
-            f"and cov_chol (d, d), got {coef.shape} and {cov_chol.shape}"
-        )
-    dtype = jnp.promote_types(coef.dtype, cov_chol.dtype)
-    policy = LinearGaussian(_converted(coef, dtype), _converted(cov_chol, dtype))
-    for field, values in policy._asdict().items():
-        checks.finite(f"{name}.{field}", values)
-    if not isinstance(policy.cov_chol, Tracer):
-        upper, diagonal = np.triu(policy.cov_chol, 1), np.diagonal(policy.cov_chol)
-        if upper.any():
-            entry = upper[upper != 0][0]
-            raise ValueError(f"{name}.cov_chol must be lower triangular, got {entry} above its diagonal")
-        checks.finite(f"the diagonal of {name}.cov_chol", diagonal, above=0.0)
-    return policy
 
 
 def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.ndarray, np.float32]:
@@ -601,7 +605,7 @@ def _checked_batch(batch: Batch, archive: Archive) -> tuple[Batch, Array | np.nd
     _warn_of_coarse_rewards(reward, told)
     reward, rest = split_reward(reward, dtype)
     # NumPy goes to the compiled program as it is: jax would not let NaN pass where it looks out for it.
-    return Batch(*(_converted(each, dtype) for each in (context, theta, reward))), rest, np.float32(eps)
+    return Batch(*(checks.converted(each, dtype) for each in (context, theta, reward))), rest, np.float32(eps)
 
 
 def _float_dtype(values: Any, otherwise: Any) -> Any:
@@ -631,34 +635,10 @@ def _warn_of_coarse_rewards(reward: Array | np.ndarray, told: Any) -> None:
         )
 
 
-def _check_fitted(fitted: LinearGaussian, policy: LinearGaussian) -> None:
-    checks.instance("what m_step returns", fitted, LinearGaussian)
-    for field, values in policy._asdict().items():
-        checks.array(f"{field} of what m_step returns", getattr(fitted, field), values.shape)
-
-
 def _checked_kl_bound(kl_bound: ScalarLike) -> ScalarLike:
     """Return a bound of one type, whatever kind of number it was: for another type jax compiles anew."""
     checks.number("kl_bound", kl_bound, above=0.0)
     return kl_bound if isinstance(kl_bound, Tracer) else np.float32(kl_bound)
-
-
-def _check_settings(
-    policy_features: FeatureMap,
-    baseline_features: FeatureMap,
-    ridge: float | int,
-    significance: float | int | None,
-) -> None:
-    _check_features("policy_features", policy_features)
-    _check_features("baseline_features", baseline_features)
-    if policy_features.context_dim != baseline_features.context_dim:
-        raise ValueError(
-            "policy_features and baseline_features must be of the same context, got "
-            f"{policy_features.context_dim} and {baseline_features.context_dim} variables"
-        )
-    checks.number("ridge", ridge, least=0.0)
-    if significance is not None and not 0 < checks.number("significance", significance) <= 1:
-        raise ValueError(f"significance must be above 0 and at most 1, or None, got {significance}")
 
 
 def _check_features(name: str, features: FeatureMap) -> None:

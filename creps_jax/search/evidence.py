@@ -15,7 +15,7 @@ from jax.scipy.special import erfc
 from creps_jax.numerics.linalg import exact_dot, normalised, safe_sqrt, weighted_mean
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["blended_cov_chol", "independence_p_value", "share_of_evidence"]
+__all__ = ["independence_p_value", "share_of_evidence"]
 
 _LEAST_VARIANCE = 1e-4
 """Squares of whitened parameters, which have a variance of 2 if Gaussian, are constant below this one."""
@@ -78,22 +78,6 @@ def share_of_evidence(p_value: ScalarLike, significance: float) -> Scalar:
         significance: The p-value, above 0, from which on it does not move.
     """
     return jnp.clip(1.0 - p_value / significance, 0.0, 1.0)
-
-
-def blended_cov_chol(
-    old: Float[Array, "d d"], new: Float[Array, "d d"], share: ScalarLike
-) -> Float[Array, "d d"]:
-    """Return the Cholesky factor of `(1 - share) old old' + share new new'`, exactly if the share is 0 or 1.
-
-    The relative entropy to the old covariance is convex in the new one: the blend keeps its bounds.
-    """
-    share = jnp.asarray(share, new.dtype)
-    # In units of the old one nothing is lost to the squares of small spreads.
-    change = solve_triangular(old, new, lower=True)
-    blend = (1.0 - share) * jnp.eye(old.shape[0], dtype=new.dtype) + share * exact_dot(change, change.T)
-    is_between = (share > 0.0) & (share < 1.0)
-    factor = jnp.linalg.cholesky(jnp.where(is_between, blend, jnp.eye(old.shape[0], dtype=new.dtype)))
-    return jnp.where(share >= 1.0, new, jnp.where(share <= 0.0, old, jnp.tril(exact_dot(old, factor))))
 
 
 def _whitened(prior: Array, features: Array, theta: Array) -> tuple[Array, Array, Scalar, Scalar]:

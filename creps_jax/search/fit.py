@@ -7,7 +7,6 @@ few samples say too much about the covariance. The bounded fit keeps the promise
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,27 +14,16 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.numerics.linalg import divided, exact_dot, safe_sqrt
+from creps_jax.policies.base import WeightedSamples
 from creps_jax.policies.gaussian import LinearGaussian, fit_weighted_ml
 from creps_jax.policies.regression import Regression, as_coefficients, coordinates, normaliser, regress
-from creps_jax.typing import Array, Bool, Float, Scalar, ScalarLike
+from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["MStep", "WeightedSamples", "bounded_ml", "fit_within", "weighted_ml"]
+__all__ = ["MStep", "bounded_ml", "fit_within", "weighted_ml"]
 
 _LOG_MULTIPLIERS = (-12.0, 40.0)
 """Range of the logarithms of the multipliers: below, a bound changes nothing; above, nothing moves."""
 _NUM_TRIALS, _NUM_REFINEMENTS = 32, 4
-
-
-class WeightedSamples(NamedTuple):
-    """What a policy is fitted to."""
-
-    features: Float[Array, "n p"]
-    """Policy features of the context of each sample."""
-    theta: Float[Array, "n d"]
-    weights: Float[Array, " n"]
-    """Weights d, which sum to one; a sample of weight zero may hold anything."""
-    is_valid: Bool[Array, " n"]
-    """Which samples count: over their contexts relative entropies are averaged."""
 
 
 MStep = Callable[..., LinearGaussian]

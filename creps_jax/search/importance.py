@@ -1,7 +1,8 @@
 """Importance weights of archived samples: how much each says about the policy of today."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,11 +10,9 @@ from jax import lax
 from jax.scipy.special import logsumexp
 
 from creps_jax import checks
-from creps_jax.numerics.linalg import exact_dot
-from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.typing import Array, Bool, Float, Int, IntScalar
 
-__all__ = ["Importance", "PolicyHistory", "empty_history", "importance_weights", "remember"]
+__all__ = ["Importance", "empty_history", "importance_weights", "remember"]
 
 _LEAST_LOG_POWER, _NUM_HALVINGS = -30.0, 25
 """Where the search for the power that keeps enough effective samples begins, and its bisections."""
@@ -42,27 +41,24 @@ class Importance:
         checks.number("least_effective", self.least_effective, least=1.0)
 
 
-class PolicyHistory(NamedTuple):
-    """The last K policies that samples were drawn from: that of iteration t in the place t mod K."""
+def empty_history(policy: Any, num_policies: int) -> Any:
+    """Make a history, whose arrays have a first axis of places, that all hold this policy.
 
-    coef: Float[Array, "K p d"]
-    cov_chol: Float[Array, "K d d"]
-
-
-def empty_history(policy: LinearGaussian, num_policies: int) -> PolicyHistory:
-    """Make a history whose places all hold this policy; no sample is of it before it is remembered."""
-    return PolicyHistory(*(jnp.broadcast_to(x, (num_policies, *x.shape)) for x in policy))
+    No sample is of it before it is remembered.
+    """
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_policies, *leaf.shape)), policy)
 
 
-def remember(history: PolicyHistory, policy: LinearGaussian, iteration: IntScalar) -> PolicyHistory:
-    """Put the policy of an iteration in the place of the oldest."""
-    place = iteration % history.coef.shape[0]
-    return PolicyHistory(*(past.at[place].set(new) for past, new in zip(history, policy, strict=True)))
+def remember(history: Any, policy: Any, iteration: IntScalar) -> Any:
+    """Put the policy of an iteration in the place of the oldest: that of iteration t in the place t mod K."""
+    place = iteration % jax.tree.leaves(history)[0].shape[0]
+    return jax.tree.map(lambda past, new: past.at[place].set(new), history, policy)
 
 
 def importance_weights(
-    policy: LinearGaussian,
-    history: PolicyHistory,
+    log_prob: Callable[[Any, Array, Array], Array],
+    policy: Any,
+    history: Any,
     features: Float[Array, "n p"],
     theta: Float[Array, "n d"],
     age: Int[Array, " n"],
@@ -77,6 +73,7 @@ def importance_weights(
     number of all samples over the number of its own: no sample of an old policy outweighs all others.
 
     Args:
+        log_prob: (policy, features, theta) -> log densities (n,), see `Policy`.
         policy: What samples are wanted of, such as the policy that the last ones were drawn from.
         history: The last K policies, that of `iteration` included.
         features: Policy features of the contexts.
@@ -92,27 +89,18 @@ def importance_weights(
 
     Source: Veach and Guibas 1995, the balance heuristic.
     """
-    num_policies = history.coef.shape[0]
+    num_policies = jax.tree.leaves(history)[0].shape[0]
     is_counted = is_valid & (age < num_policies)
     place = (iteration - age) % num_policies
     drawn = jax.nn.one_hot(place, num_policies, dtype=theta.dtype) * is_counted[:, None].astype(theta.dtype)
     share = jnp.sum(drawn, axis=0) / jnp.maximum(jnp.sum(drawn), 1.0)
-    # All densities lack the same factor, which no ratio knows.
-    past = jax.vmap(_log_density, (0, 0, None, None))(*history, features, theta)
+    past = jax.vmap(log_prob, (0, None, None))(history, features, theta)
     log_mixture = logsumexp(past, axis=0, b=share[:, None])
-    log_ratio = _log_density(*policy, features, theta) - log_mixture
+    log_ratio = log_prob(policy, features, theta) - log_mixture
     log_ratio = jnp.where(is_counted & jnp.isfinite(log_ratio), log_ratio, -jnp.inf)
     largest = jnp.max(log_ratio)
     log_ratio = log_ratio - jnp.where(jnp.isfinite(largest), largest, 0.0)
     return _flattened(log_ratio, least_effective)
-
-
-def _log_density(coef: Array, cov_chol: Array, features: Array, theta: Array) -> Array:
-    # One small inverse and a product: a triangular system for each sample takes many times as long.
-    eye = jnp.eye(len(cov_chol), dtype=cov_chol.dtype)
-    inverse = jax.scipy.linalg.solve_triangular(cov_chol, eye, lower=True)
-    whitened = exact_dot(theta - exact_dot(features, coef), inverse.T)
-    return -0.5 * jnp.sum(whitened**2, axis=1) - jnp.sum(jnp.log(jnp.diagonal(cov_chol)))
 
 
 def _flattened(log_weight: Array, least_effective: float) -> Array:

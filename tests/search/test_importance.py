@@ -7,12 +7,14 @@ import pytest
 import scipy.stats
 
 from creps_jax.policies.features import linear_features
-from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian, linear_gaussian
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import creps
+from creps_jax.search.fit import weighted_ml
 from creps_jax.search.importance import Importance, empty_history, importance_weights, remember
 
 FEATURES = linear_features(1)
+GAUSSIAN = linear_gaussian(FEATURES, m_step=weighted_ml)
 NUM_EACH, NUM_POLICIES, DIM = 40, 3, 2
 SETTINGS = {"archive_size": 200}
 WEIGHTED = creps(FEATURES, FEATURES, importance=Importance(NUM_POLICIES), **SETTINGS)
@@ -46,8 +48,9 @@ def weights_of(key, num_valid=None, least_effective=1.0):
     policy, history, features, theta, age = drawn_from_all(key)
     is_valid = jnp.arange(len(age)) < (len(age) if num_valid is None else num_valid)
     iteration = jnp.int32(NUM_POLICIES - 1)
+    samples = features, theta, age, is_valid, iteration
     settings = {"least_effective": least_effective}
-    return importance_weights(policy, history, features, theta, age, is_valid, iteration, **settings)
+    return importance_weights(GAUSSIAN.log_prob, policy, history, *samples, **settings)
 
 
 def densities(policy, features, theta):
