@@ -322,9 +322,10 @@ def _check_counts(settings: Any) -> None:
 def _identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
     """Return what has to agree for a checkpoint to belong to a run: all but how long it goes on."""
     same = {key: value for key, value in dataclasses.asdict(settings).items() if key != "iterations"}
-    # Checkpoints from before there was a choice of robots do not name one.
-    if same.get("robot") == _PAPERS_ROBOT:
-        del same["robot"]
+    # Checkpoints from before there was a choice of robots, or of a first policy, do not name one.
+    for name, default in (("robot", _PAPERS_ROBOT), ("start_policy", None)):
+        if name in same and same[name] == default:
+            del same[name]
     return {"experiment": name, "seed": seed, "settings": same}
 
 

@@ -28,7 +28,14 @@ from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constraine
 from creps_jax.tasks.conditions import Condition
 from creps_jax.tasks.walking import WalkNoise, nao_walk
 from creps_jax.tools import plots, tables
-from creps_jax.tools.play import POLICY, START_UP, filmed_speeds, record, save_film
+from creps_jax.tools.play import (
+    POLICY,
+    START_UP,
+    filmed_speeds,
+    load_walking_policy,
+    record,
+    save_film,
+)
 from creps_jax.tools.robots import WALKERS, Bounds, Walker, find_walker
 from creps_jax.training import evaluate
 from creps_jax.walking.params import (
@@ -93,6 +100,8 @@ class Settings:
         start_mean: mean of the first policy before squashing; 0 is the middle of the box.
         start_std: its standard deviation before squashing. With a penalty the first policy is, to first
             order, the same.
+        start_policy: policy file to go on from, in place of start_mean and start_std; it must have the same
+            features and bounds.
         low: lowest speed, m/s; None is the robot's own.
         high: highest speed, m/s; None is the robot's own.
         duration: length of an episode of the evaluation, s.
@@ -126,6 +135,7 @@ class Settings:
     constraint: str = "sigmoid"
     start_mean: float = 0.0
     start_std: float = 1.0
+    start_policy: str | None = None
     low: float | None = None
     high: float | None = None
     duration: float = 8.0
@@ -366,7 +376,17 @@ def make_algorithm(settings: Settings) -> Creps:
 
 
 def first_policy(settings: Settings) -> LinearGaussian:
-    """Return the policy to begin with: the same for every context."""
+    """Return the policy to begin with: a file's, or one that is the same for every context.
+
+    Raises:
+        UserError: if the file cannot be read, or its policy has other features or bounds.
+    """
+    if settings.start_policy is not None:
+        learned = load_walking_policy(Path(settings.start_policy), settings.robot)
+        wanted = settings.features.make(*settings.context_range()), parameter_space(settings)
+        if (learned.features, learned.parameters) != wanted:
+            raise UserError(f"{settings.start_policy} has other features or bounds than these settings")
+        return learned.policy
     num_features = settings.features.make(*settings.context_range()).size
     mean, std = (
         jnp.full(len(PARAM_NAMES), settings.start_mean),

@@ -206,6 +206,16 @@ def test_the_first_policy_is_the_same_for_every_speed(kind):
         np.testing.assert_allclose(policy.mean(speed), np.full(10, -0.5), rtol=1e-5)
 
 
+def test_a_run_can_go_on_from_a_policy(tmp_path):
+    settings = walk.SETTINGS["best"]
+    shipped = dataclasses.replace(settings, start_policy=str(SHIPPED))
+    start, loaded = walk.first_policy(shipped), load(SHIPPED)
+    jax.tree.map(np.testing.assert_array_equal, start, loaded.policy)
+    for other in ({"bounds": "paper"}, {"features": walk.Features("rbf", 4)}, {"high": 0.5}):
+        with pytest.raises(UserError, match=r"walk\.npz has other features or bounds"):
+            walk.first_policy(dataclasses.replace(shipped, **other))
+
+
 def test_settings_come_back_from_a_manifest():
     settings = walk.Settings(features=walk.Features("linear"))
     assert walk.Settings(**dataclasses.asdict(settings)) == settings
@@ -343,7 +353,7 @@ def test_resume_finds_the_latest_unfinished_run_of_the_robot(bench):
 def test_a_run_from_before_robots_can_be_resumed(bench, physics):
     """Its checkpoint has the settings of its manifest, without a robot: they have to be the same still."""
     settings = dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"].resolved(), physics=physics))
-    del settings["robot"]
+    del settings["robot"], settings["start_policy"]
     unfinished("1", settings)
     begin = runner.default_settings(walk, "walk", resume=True)
     resumed, _, manifest = runner._resumed(walk, runner.Request("walk", begin, resume=True))
