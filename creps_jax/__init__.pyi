@@ -9,7 +9,7 @@ from .policies.features import (
     quadratic_features,
     rbf_features,
 )
-from .policies.gaussian import LinearGaussian, fit_weighted_ml, linear_gaussian
+from .policies.gaussian import LinearGaussian, fit_weighted_ml, linear_gaussian, start_policy
 from .policies.learned import Learned, load, save
 from .policies.space import Space, sigmoid_gate
 from .robots.nao_kinematics import leg_fk, leg_ik
@@ -80,6 +80,7 @@ __all__ = [
     "simulation",
     "sinus",
     "solve_dual",
+    "start_policy",
     "tasks",
     "thomas_solve",
     "train",

@@ -253,11 +253,11 @@ def task() -> Argument:
         return dataclasses.replace(TASK, rollout=lambda key, context, theta: make(theta))
 
     outcomes = {
-        "float32": lambda theta: theta.sum(),
         "None": lambda theta: None,
         "'good'": lambda theta: tasks.PlainOutcome("good", jnp.zeros(0)),
         "(2,)": lambda theta: tasks.PlainOutcome(theta, jnp.zeros(0)),
         "{'reward'": lambda theta: {"reward": 0.0},
+        "(2,)|float32": lambda theta: theta,
         "complex64": lambda theta: tasks.PlainOutcome(1j * theta.sum(), jnp.zeros(0)),
     }
     bad_rollouts = [(with_outcome(make), shown) for shown, make in outcomes.items()]
@@ -644,6 +644,13 @@ ROWS = {
         use=lambda _: 0,
         mean_kl_bound=number(0.5, above=0.0),
         cov_kl_bound=number(0.05, above=0.0),
+    ),
+    "start_policy": row(
+        cj.start_policy,
+        features=features(),
+        theta_dim=count(2),
+        mean=vector((0.0, 1.0)),
+        std=vector((1.0, 2.0)),
     ),
     "linear_gaussian": row(
         cj.linear_gaussian,

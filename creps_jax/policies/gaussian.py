@@ -18,7 +18,7 @@ from creps_jax.numerics.linalg import divided, exact_dot, safe_cholesky, safe_sq
 from creps_jax.policies.base import Policy, WeightedSamples
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.regression import Regression, as_coefficients, regress
-from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike
+from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike, VectorLike
 
 __all__ = [
     "LinearGaussian",
@@ -31,6 +31,7 @@ __all__ = [
     "log_prob",
     "mean",
     "sample",
+    "start_policy",
 ]
 
 _LOG_TWO_PI = 1.8378770664093453
@@ -46,6 +47,44 @@ class LinearGaussian(NamedTuple):
     """The coefficients A: one row a feature, one column a parameter."""
     cov_chol: Float[Array, "d d"]
     """The lower Cholesky factor of the covariance Sigma; its diagonal is positive."""
+
+
+@checks.arguments
+def start_policy(
+    features: FeatureMap, theta_dim: int, *, mean: VectorLike = 0.0, std: VectorLike = 1.0
+) -> LinearGaussian:
+    """Make a policy to begin a search with: the same for every context.
+
+    Args:
+        features: The policy's features.
+        theta_dim: Number d of parameters.
+        mean: Mean of the parameters: a number for all, or one for each.
+        std: Their standard deviations, likewise.
+
+    Returns:
+        The policy, whose parameters are independent of each other.
+
+    Raises:
+        ValueError: If there is not one number for each parameter, a standard deviation is not above zero, or
+            the mean is not zero and the features cannot express a constant.
+    """
+    means, stds = (
+        np.asarray(checks.vector(name, value), np.float32) for name, value in (("mean", mean), ("std", std))
+    )
+    for name, values in (("mean", means), ("std", stds)):
+        if values.shape not in ((), (1,), (theta_dim,)):
+            raise ValueError(
+                f"{name} must be a number or one for each of {theta_dim} parameters, got shape {values.shape}"
+            )
+    if not np.all(stds > 0):
+        raise ValueError(f"std must be above zero, got {std}")
+    if features.constant is None and np.any(means != 0):
+        raise ValueError(f"mean must be zero for features that cannot express a constant, got {mean}")
+    constant = np.zeros(features.size) if features.constant is None else np.asarray(features.constant)
+    coef = constant[:, None] * np.broadcast_to(means, theta_dim)[None, :]
+    return LinearGaussian(
+        jnp.asarray(coef, jnp.float32), jnp.diag(jnp.asarray(np.broadcast_to(stds, theta_dim)))
+    )
 
 
 def mean(policy: LinearGaussian, features: Float[Array, " p"]) -> Float[Array, " d"]:

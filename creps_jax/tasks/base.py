@@ -63,7 +63,7 @@ class Task(KeepsPrograms):
 
     Attributes:
         sample_context: (key) -> context (s,).
-        rollout: (key, context (s,), theta (d,)) -> outcome of one rollout.
+        rollout: (key, context (s,), theta (d,)) -> outcome of one rollout, or its reward alone.
         context_dim: Number s of context variables.
         theta_dim: Number d of parameters.
         worst_reward: The finite reward put in place of one that is not finite.
@@ -93,14 +93,19 @@ class Task(KeepsPrograms):
 def check_outcome(outcome: Any) -> Any:
     """Return what a rollout gave, after checking that it is an outcome of arrays with one reward.
 
+    A bare reward becomes a `PlainOutcome`.
+
     Raises:
-        ValueError: If it is not.
+        ValueError: If it is neither.
     """
     if not isinstance(outcome, Outcome):
-        raise ValueError(
-            "a rollout must return an Outcome, a NamedTuple with reward and violation such as PlainOutcome, "
-            f"got {checks.shown(outcome)}"
-        )
+        if not isinstance(outcome, jax.Array | np.ndarray | float | int) or isinstance(outcome, bool):
+            raise ValueError(
+                "a rollout must return a reward, or an Outcome, a NamedTuple with reward and violation such "
+                f"as PlainOutcome, got {checks.shown(outcome)}"
+            )
+        reward = checks.array("the reward of a rollout", outcome, ())
+        return PlainOutcome(reward, jnp.zeros(0, reward.dtype))
     checks.array("the reward of a rollout", outcome.reward, ())
     for leaf in jax.tree.leaves(outcome):
         checks.array("each field of a rollout's outcome", leaf)

@@ -6,8 +6,22 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from creps_jax.policies.features import linear_features, rbf_features
-from creps_jax.policies.gaussian import LinearGaussian, entropy, fit_weighted_ml, kl, log_prob, mean, sample
+from creps_jax.policies.features import (
+    linear_features,
+    polynomial_features,
+    quadratic_features,
+    rbf_features,
+)
+from creps_jax.policies.gaussian import (
+    LinearGaussian,
+    entropy,
+    fit_weighted_ml,
+    kl,
+    log_prob,
+    mean,
+    sample,
+    start_policy,
+)
 
 COEF = np.array([[1.0, -2.0, 0.5], [3.0, 0.0, -1.0]])
 ROOT = np.array([[0.5, 0.0, 0.0], [0.2, 1.0, 0.0], [-0.3, 0.4, 2.0]])
@@ -475,3 +489,32 @@ def test_bad_shapes_are_named():
         kl(policy(), policy(np.ones((2, 2)), np.eye(2)), FEATURES)
     with pytest.raises(ValueError, match=r"theta must have shape \(4, d\) beside .*, got \(5, 3\)"):
         fit_weighted_ml(jnp.ones((4, 2)), jnp.ones((5, 3)), jnp.ones(5), ridge=0.0)
+
+
+@pytest.mark.parametrize(
+    "features", [linear_features(2), polynomial_features(2, 3), rbf_features([0, 0], [1, 1], (2, 3))]
+)
+def test_a_start_policy_is_the_same_for_every_context(features, key):
+    policy = start_policy(features, 3, mean=(1.0, -2.0, 0.5), std=0.1)
+    contexts = jax.random.normal(key, (20, 2))
+    means = features(contexts) @ policy.coef
+    np.testing.assert_allclose(means, np.tile([1.0, -2.0, 0.5], (20, 1)), rtol=1e-5)
+    np.testing.assert_allclose(policy.cov_chol, 0.1 * np.eye(3), rtol=1e-6)
+    assert policy.coef.dtype == policy.cov_chol.dtype == jnp.float32
+
+
+@pytest.mark.parametrize(
+    ("features", "settings", "match"),
+    [
+        (linear_features(1), {"mean": (1.0, 2.0, 3.0)}, r"mean must be .* 2 parameters, got shape \(3,\)"),
+        (linear_features(1), {"std": 0.0}, "std must be above zero, got 0"),
+        (
+            quadratic_features(1),
+            {"mean": 1.0},
+            "mean must be zero for features that cannot express",
+        ),
+    ],
+)
+def test_a_start_policy_that_cannot_be_is_refused(features, settings, match):
+    with pytest.raises(ValueError, match=match):
+        start_policy(features, 2, **settings)

@@ -1,5 +1,6 @@
 """Wrappers change what they promise, keep every other field, and refuse what does not fit."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -7,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from creps_jax.tasks import Outcome, Task, average_repeats, penalised, sigmoid_constrained
+from creps_jax.tasks import Outcome, PlainOutcome, Task, average_repeats, penalised, sigmoid_constrained
+from creps_jax.training import evaluate
 
 
 class NoisyOutcome(NamedTuple):
@@ -40,6 +42,22 @@ CONTEXT, THETA = jnp.asarray([3.0]), jnp.asarray([0.25, -0.5])
 def test_any_named_tuple_with_the_two_fields_is_an_outcome(task, key):
     assert isinstance(task.rollout(key, CONTEXT, THETA), Outcome)
     assert not isinstance((1.0, 2.0), Outcome)
+
+
+def test_a_bare_reward_is_an_outcome_everywhere(key):
+    bare = Task(lambda key: jnp.zeros(1), lambda key, context, theta: -jnp.sum(theta**2), 1, 2, -100)
+    full = dataclasses.replace(bare, rollout=lambda *given: PlainOutcome(bare.rollout(*given), jnp.zeros(0)))
+    wrappers = (
+        lambda task: task,
+        lambda task: average_repeats(task, 2),
+        lambda task: sigmoid_constrained(task, 0.0, 1.0),
+        lambda task: penalised(task, 0.0, 1.0, 5.0),
+    )
+    for wrap in wrappers:
+        found, expected = (
+            evaluate(key, wrap(task), jnp.zeros((3, 1)), jnp.ones((3, 2))) for task in (bare, full)
+        )
+        jax.tree.map(np.testing.assert_array_equal, found, expected)
 
 
 def test_average_is_the_mean_of_single_rollouts(task, key):
