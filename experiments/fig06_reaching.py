@@ -49,7 +49,8 @@ class Settings(LearnerSettings):
     bandwidth: float = 0.5**0.5
 
 
-SETTINGS = {"paper": Settings(), "quick": Settings(iterations=200, trials=5)}
+# RBFs are behind for half of the iterations: with fewer of them, or fewer trials, its claims cannot be held.
+SETTINGS = {"paper": Settings(), "quick": Settings(trials=10)}
 
 
 def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:

@@ -202,7 +202,9 @@ def test_refuses_an_archive_that_no_policy_could_be_fitted_to():
 @pytest.mark.parametrize("shape", [(1,), (4, 2), (0, 1), (4, 1, 1)])
 def test_refuses_contexts_of_the_wrong_shape(key, state, shape):
     for call in (lambda c: ALGORITHM.ask(key, state, c), lambda c: ALGORITHM.mean(state.policy, c)):
-        with pytest.raises(ValueError, match=r"contexts must have shape \(n, 1\), got") as error:
+        with pytest.raises(
+            ValueError, match=r"contexts must have shape \(n, 1\) for features of 1 context variables, got"
+        ) as error:
             call(jnp.zeros(shape))
         assert str(shape) in str(error.value)
 

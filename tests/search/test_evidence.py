@@ -7,10 +7,10 @@ import pytest
 from scipy import stats
 
 from creps_jax.policies.features import linear_features, rbf_features
-from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian, blended_cov_chol
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import creps
-from creps_jax.search.evidence import _f_survival, blended_cov_chol, independence_p_value, share_of_evidence
+from creps_jax.search.evidence import _f_survival, independence_p_value, share_of_evidence
 from creps_jax.search.fit import bounded_ml, weighted_ml
 
 
