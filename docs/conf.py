@@ -32,7 +32,7 @@ maximum_signature_line_length = 88
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:obj", ".*"),
-    ("py:class", r"(collections|jax|jaxlib|jaxtyping|mujoco|np)\..+"),
+    ("py:class", r"(collections|jax|jaxlib|os|jaxtyping|mujoco|np)\..+"),
     ("py:class", "Array|ArrayLike|Bool|Features|Float|Int|Key|Path|Rewards|UInt32|ndarray"),
 ]
 

@@ -1,6 +1,7 @@
 """What the documents say runs: the README's example, and the notebooks from top to bottom."""
 
 import doctest
+import importlib.util
 import os
 import re
 from pathlib import Path
@@ -16,21 +17,38 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 QUICK = ("first_policy", "first_walk")
 
 
-def test_readme_example_runs():
+def test_readme_example_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     failed, tried = doctest.testfile(str(ROOT / "README.md"), module_relative=False)
     assert failed == 0
     assert tried >= 10
 
 
-@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "experiments/DEVIATIONS.md"])
+PAGES = [
+    "README.md",
+    "CONTRIBUTING.md",
+    "experiments/DEVIATIONS.md",
+    *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
+]
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_files_that_a_page_names_are_there(page):
     text = (ROOT / page).read_text()
-    named = set(re.findall(r"`([a-z_]+/[\w/]+\.(?:py|md))`", text))
-    assert named
-    missing = {
-        path for path in named if not ((ROOT / path).is_file() or (ROOT / "creps_jax" / path).is_file())
-    }
-    assert not missing
+    folders = (ROOT, ROOT / "creps_jax")
+    named = re.findall(r"`([a-z_]+/[\w/]+\.(?:py|md))`", text)
+    assert not [name for name in named if not any((folder / name).is_file() for folder in folders)]
+    links = re.findall(r"\]\(([^)#:\s]+)\)", text)
+    assert not [link for link in links if not ((ROOT / page).parent / link).exists()]
+
+
+def test_the_page_of_equations_says_where_they_are():
+    spec = importlib.util.spec_from_file_location("equations", ROOT / "docs" / "equations.py")
+    equations = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(equations)
+    computed = {number for number, places in equations.tagged().items() if places}
+    assert computed == set(range(1, 19)) - equations.NOT_COMPUTED.keys()
+    assert equations.PAGE.read_text() == equations.page(), "write it anew: python docs/equations.py"
 
 
 def test_there_are_notebooks():

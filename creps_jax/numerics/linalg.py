@@ -75,12 +75,13 @@ def thomas_solve(
         upper_above, rhs_above = above
         low, pivot, up, value = row
         denominator = pivot - low * upper_above
-        scaled = (up / denominator, (value - low * rhs_above) / denominator)
-        return scaled, scaled
+        scaled_upper = up / denominator  # Eq. 7
+        scaled_rhs = (value - low * rhs_above) / denominator  # Eq. 8
+        return (scaled_upper, scaled_rhs), (scaled_upper, scaled_rhs)
 
     def substitute(x_below: Array, row: _Pair) -> _Pair:
         scaled_upper, scaled_rhs = row
-        x = scaled_rhs - scaled_upper * x_below
+        x = scaled_rhs - scaled_upper * x_below  # Eq. 9
         return x, x
 
     zero = jnp.zeros_like(rhs[0])

@@ -328,7 +328,8 @@ class _Radial:
             is_nearest = distance == jnp.min(distance, axis=0)[None, :]
             costs = jnp.where(is_narrow[None, :], jnp.where(is_nearest, 0.0, jnp.inf), costs)
         # Without the barrier compilers put the costs into the sum over them: all of them anew for each.
-        return jax.nn.softmax(jnp.asarray(lax.optimization_barrier(-jnp.sum(costs, axis=1))))
+        # In print: psi_j / sum of psi, psi_j = exp(-(s - c_j)^2 / (2 sigma^2))
+        return jax.nn.softmax(jnp.asarray(lax.optimization_barrier(-jnp.sum(costs, axis=1))))  # Eq. 16
 
 
 _KINDS = {"linear": _Linear, "quadratic": _Quadratic, "polynomial": _Polynomial, "rbf": _Radial}

@@ -211,7 +211,7 @@ def fit_weighted_ml(
 
     Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
     """
-    fit = regress(features, theta, weights, ridge=ridge, scale=scale, start=start)  # Eq. 14
+    fit = regress(features, theta, weights, ridge=ridge, scale=scale, start=start)
     coef = as_coefficients(fit.basis, fit.solution.at[0].add(fit.centre), fit.size)
     coef = coef if start is None else start + coef
     return LinearGaussian(coef, fit.size[:, None] * _weighted_cov_chol(fit))
@@ -224,6 +224,7 @@ def _weighted_cov_chol(fit: Regression) -> Float[Array, "d d"]:
     the spread of each parameter. A parameter without spread gets that of its rounding.
     """
     residual = fit.rest - exact_dot(fit.rows, fit.solution)
+    # In print: Sigma = sum of d (theta - A' phi) (theta - A' phi)' / Z
     scatter = exact_dot(residual.T, residual) / fit.normaliser  # Eq. 15
     spread = jnp.maximum(safe_sqrt(jnp.diagonal(scatter)), 4.0 * jnp.finfo(residual.dtype).eps)
     correlation = scatter / (spread[:, None] * spread[None, :])
@@ -234,7 +235,7 @@ def _weighted_cov_chol(fit: Regression) -> Float[Array, "d d"]:
 def linear_gaussian(
     features: FeatureMap, *, m_step: Callable[..., LinearGaussian], ridge: float | int = 1e-4
 ) -> Policy:
-    """Make the kind of policy whose states are `LinearGaussian`s.
+    """Make the kind of policy whose states are `LinearGaussian` records.
 
     Args:
         features: Features varphi(s) that the mean is linear in.

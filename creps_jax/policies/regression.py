@@ -109,6 +109,7 @@ def regress(
     penalty = _penalty(basis, rows, jnp.sqrt(jnp.asarray(ridge, theta.dtype)))
     orthogonal, triangular = jnp.linalg.qr(jnp.concatenate([rows, penalty]))
     orthogonal, of_penalty = orthogonal[: len(rows)], orthogonal[len(rows) :]
+    # In print: A = (Phi' D Phi)^-1 Phi' D U
     solution = jax.scipy.linalg.solve_triangular(triangular, exact_dot(orthogonal.T, rest))  # Eq. 14
     # The residuals are (I - Q Q') Y. Their expected scatter is 1 - sum d h with the leverages h = |Q_i|^2,
     # but for what the ridge adds: with it, Q' Q = I - T' T for the rows T of Q that belong to the penalty.
@@ -151,6 +152,7 @@ def normaliser(used: Scalar, num_coordinates: int) -> Scalar:
     `sum d^2`, as in print; p features use more. As many samples as features leave no residuals: their Z is
     not zero, but the resolution of the format.
     """
+    # In print: Z = ((sum d)^2 - sum d^2) / sum d
     return jnp.maximum(1.0 - used, 4.0 * num_coordinates * jnp.finfo(used.dtype).eps)  # Eq. 15
 
 

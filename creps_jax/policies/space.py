@@ -173,7 +173,8 @@ def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike)
     theta, low, high = _box(theta, low, high)
     # Divided by a power of two, results are the same to the bit.
     unit = jnp.where(high - low > _WIDE, 16.0, 1.0).astype(theta.dtype)
-    gated = (low / unit + jax.nn.sigmoid(theta) * (high / unit - low / unit)) * unit
+    # In print: theta' = 1 / (1 + exp(-theta)) (UB - LB) + LB
+    gated = (low / unit + jax.nn.sigmoid(theta) * (high / unit - low / unit)) * unit  # Eq. 17
     # The clip takes back the last bit that rounding can put outside the box.
     return jnp.clip(gated, low, high)
 

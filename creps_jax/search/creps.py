@@ -477,9 +477,9 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
     samples, history = _samples(settings, state)
     features, baseline, theta, reward, resolution, prior, is_valid = samples
     given = reward, baseline, prior
-    dual, weights = solve_and_weigh(*given, kl_bound=kl_bound, resolution=resolution)  # Eq. 13
+    dual, weights = solve_and_weigh(*given, kl_bound=kl_bound, resolution=resolution)
     kind, old = settings.kind, state.policy
-    fitted = kind.fit(old, WeightedSamples(features, theta, weights, is_valid))  # Eq. 14, 15
+    fitted = kind.fit(old, WeightedSamples(features, theta, weights, is_valid))
 
     noise = theta - kind.mean(old, features) if kind.noise is None else kind.noise(old, features, theta)
     p_value = independence_p_value(weights, prior, features, noise)

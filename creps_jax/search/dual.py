@@ -104,7 +104,8 @@ def _dual(
     mean_features = exact_dot(prior, features)
     advantage = (reward - exact_dot(features, baseline_coef)) / temperature
     log_mean = logsumexp(advantage + _log(prior), where=prior > 0)
-    return temperature * kl_bound + exact_dot(mean_features, baseline_coef) + temperature * log_mean
+    # In print: g = eta epsilon + phi^' w + eta log(mean of exp((R - phi' w) / eta))
+    return temperature * kl_bound + exact_dot(mean_features, baseline_coef) + temperature * log_mean  # Eq. 13
 
 
 def solve_dual(
@@ -257,7 +258,9 @@ def _weights(solution: DualSolution, samples: "_Samples") -> Array:
     temperature = jnp.ldexp(jnp.asarray(solution.temperature, dtype), -samples.reward_exponent)
     temperature = jnp.maximum(temperature, jnp.finfo(dtype).tiny)
     advantage = (samples.reward - exact_dot(samples.features, coef)) / temperature
-    weights = jnp.where(solution.is_informative, _softmax(advantage, samples.prior), samples.prior)
+    # In print: p = q mu exp((R - V) / eta), up to a factor
+    weights = _softmax(advantage, samples.prior)  # Eq. 12
+    weights = jnp.where(solution.is_informative, weights, samples.prior)
     return jnp.where(samples.is_counted, weights, 0.0)
 
 

@@ -188,9 +188,8 @@ def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | in
         theta = checks.array("theta", theta, (task.theta_dim,))
         violation = space.violation(theta, low, high)
         outcome = check_outcome(task.rollout(key, context, jnp.clip(theta, low, high)))
-        return outcome._replace(
-            reward=outcome.reward - space.penalty(violation, penalty), violation=violation
-        )
+        reward = outcome.reward - space.penalty(violation, penalty)  # Eq. 18
+        return outcome._replace(reward=reward, violation=violation)
 
     return dataclasses.replace(task, rollout=rollout, worst_reward=task.worst_reward - penalty)
 

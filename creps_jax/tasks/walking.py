@@ -262,7 +262,7 @@ def nao_walk(
         measured = jnp.maximum(end.tick - start_up_ticks, 1).astype(theta.dtype) * CONTROL_PERIOD
         speed = (end.robot.qpos[:2] - end.measured_from) / measured
         value = -reward.speed * (speed[0] - context[0]) ** 2 - reward.drift * speed[1] ** 2
-        value = value - reward.fall * end.has_fallen.astype(theta.dtype)
+        value = value - reward.fall * end.has_fallen.astype(theta.dtype)  # Eq. 18
         seconds = end.tick.astype(theta.dtype) * CONTROL_PERIOD
         return WalkOutcome(value, jnp.zeros(0, theta.dtype), end.has_fallen, speed, seconds)
 

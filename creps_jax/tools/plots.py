@@ -16,9 +16,10 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, NullLocator
 
 from creps_jax import files
 
-COLOURS = ("#0b6e99", "#d1495b", "#edae49", "#3d7a4f", "#7a5195", "#2f9e8f")
+COLOURS = ("#0072b2", "#d55e00", "#e69f00", "#009e73", "#cc79a7", "#56b4e9")
+"""Colours that colour-blind people can tell apart (Okabe and Ito 2008)."""
 PAPER_COLOUR = "#8a8a8a"
-FALL_COLOUR = "#d1495b"
+FALL_COLOUR = COLOURS[1]
 
 TRACES = {
     "kl": ("KL of the weights (nats)", False),
@@ -153,18 +154,15 @@ def learning_curves(
         for label, value in (references or {}).items():
             axes.axhline(value, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label=label)
         _over_episodes(axes, title)
-        if rows == 1:
-            axes.legend(loc="lower right", fontsize=10 if columns < 3 else 7)
         if not share:
             reward_scale(axes, [rewards for _, rewards in curves.values()])
     for axes in grid[:, 0]:
         axes.set_ylabel("mean reward")
-    if rows > 1:  # one for all: in each of many small panels it would hide the curves
-        drawn = [axes.get_legend_handles_labels() for axes in grid.flat]
-        handles = {
-            label: handle for lines, names in drawn for handle, label in zip(lines, names, strict=True)
-        }
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+    # One for all panels, and below them, where it hides no curve.
+    drawn = [axes.get_legend_handles_labels() for axes in grid.flat]
+    handles = {label: handle for lines, names in drawn for handle, label in zip(lines, names, strict=True)}
+    in_a_row = min(len(handles), max(2, round(width / 2.0)))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=in_a_row)
     if share:
         curves = [rewards for curves in panels.values() for _, rewards in curves.values()]
         reward_scale(grid[0, 0], curves)

@@ -31,13 +31,15 @@ def spring_height(
     """
     oscillation = amplitude * jnp.cos(2.0 * math.pi * phase)
     omega = 2.0 * math.pi / duration
-    return rest_height + oscillation, -(omega**2) * oscillation
+    height = rest_height + oscillation  # Eq. 3
+    return height, -(omega**2) * oscillation  # Eq. 4
 
 
 def _neighbour_weight(com_height, com_height_acc, duration):
     """a(k) = c(k) of Eq. 6, with `g + z''` and the sampling period squared: see Eq. 1 and 5."""
     period = duration / (com_height.shape[0] - 1)
-    return -com_height / ((GRAVITY + com_height_acc) * period**2)
+    # In print: a(k) = c(k) = -z / ((g - z'') T^2)
+    return -com_height / ((GRAVITY + com_height_acc) * period**2)  # Eq. 6
 
 
 @checks.arguments
@@ -75,12 +77,13 @@ def com_trajectory(
     checks.finite("com_height_acc", com_height_acc, above=-GRAVITY)
     checks.number("duration", duration, above=0.0)
     weight = _neighbour_weight(com_height, com_height_acc, duration)
-    # First and last row say x(1) = start and x(n) = end.
+    # First and last row, the cases k = 1 and k = n of the print, say x(1) = start and x(n) = end.
     inner = jnp.ones_like(zmp).at[jnp.array([0, -1])].set(0.0)
-    neighbour = weight * inner
-    rhs = zmp.at[0].set(start).at[-1].set(end)
+    neighbour = weight * inner  # Eq. 7
+    rhs = zmp.at[0].set(start)  # Eq. 8
+    rhs = rhs.at[-1].set(end)  # Eq. 9
     checks.finite("zmp", rhs)
-    return thomas_solve(neighbour, 1.0 - 2.0 * neighbour, neighbour, rhs)
+    return thomas_solve(neighbour, 1.0 - 2.0 * neighbour, neighbour, rhs)  # Eq. 6
 
 
 @checks.arguments
@@ -92,4 +95,6 @@ def zmp_of_com(
 ) -> Float[Array, " n-2"]:
     """Return the ZMP of a CoM trajectory at its inner nodes (Abdolmaleki et al. 2016, Eq. 1 and 5)."""
     weight = _neighbour_weight(com_height, com_height_acc, duration)[1:-1]
-    return com[1:-1] + weight * (com[:-2] - 2.0 * com[1:-1] + com[2:])
+    # In print: x_ZMP = x - x'' z / (g + z'')
+    difference = com[:-2] - 2.0 * com[1:-1] + com[2:]  # Eq. 5
+    return com[1:-1] + weight * difference  # Eq. 1

@@ -102,7 +102,8 @@ def plan_step(
     height, height_acc = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
     com_height = height + (robot.geometry.ankle_height + robot.com_above_hip)
     solve = jax.vmap(com_trajectory, in_axes=(1, None, None, 0, 0, None), out_axes=1)
-    com = solve(zmp, com_height, height_acc, start[:2], end[:2], params.step_duration)
+    # Along x and, by Eq. 2 in place of Eq. 1, along y.
+    com = solve(zmp, com_height, height_acc, start[:2], end[:2], params.step_duration)  # Eq. 2
     return StepPlan(footstep, com, jnp.stack([start[2], end[2]])), after
 
 
