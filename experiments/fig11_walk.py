@@ -63,7 +63,7 @@ PANELS = {
     "Protocols": ("paper", "plain", "rbf"),
 }
 _SMOOTHED = 450
-"""Rollouts, the last ones, whose mean reward tells how far learning is: one fall in them is -.2."""
+"""Rollouts, the last ones, whose mean reward tells how far learning is: one fall in them is -0.2."""
 
 Settings = walk.Settings
 SETTINGS = {

@@ -151,7 +151,7 @@ bounded = searches(epsilons[1:2], trials, cj.bounded_ml(mean_kl_bound=0.4, cov_k
 
 # %% [markdown]
 # A small epsilon is slow. A large one runs after the luckiest few, and is soon sure of something wrong. But
-# .5 stops short as well, and the right picture tells why: epsilon bounds the weights, and the Gaussian
+# 0.5 stops short as well, and the right picture tells why: epsilon bounds the weights, and the Gaussian
 # fitted to them moves farther (thin lines: the bounds), as 100 samples say too much about its spread.
 # `bounded_ml` bounds what mean and covariance really do, and the search goes on.
 

@@ -45,7 +45,7 @@ from creps_jax.tools.plots import PAPER_COLOUR, parameters_against_context
 # ## The policy
 #
 # `python -m experiments run walk --preset best` learned it, from nothing but the speed reached and the
-# falls. On two cores that takes a quarter of an hour, so here we load it. Up to .3 m/s it takes longer
+# falls. On two cores that takes a quarter of an hour, so here we load it. Up to 0.3 m/s it takes longer
 # steps to go faster, then quicker ones. The dotted lines are bounds.
 
 # %%

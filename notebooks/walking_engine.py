@@ -47,7 +47,7 @@ from creps_jax.walking.zmp import zmp_reference
 
 # %%
 theta = cj.load(ROOT / "models" / "nao" / "policies" / "walk.npz").theta(0.3)
-print("What the shipped policy answers when asked for .3 m/s:")
+print("What the shipped policy answers when asked for 0.3 m/s:")
 for name, value, unit in zip(PARAM_NAMES, theta, PARAM_UNITS, strict=True):
     print(f"    {name:15} {value:6.3f} {unit}")
 

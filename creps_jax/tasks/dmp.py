@@ -15,7 +15,7 @@ __all__ = ["DmpTrajectory", "dmp_trajectory", "fit_dmp"]
 # The attractor is critically damped. Time constants of it that go by in one duration: a distance between
 # start and goal shrinks to 5e-5 of it.
 _RATE = 12.5
-# The phase falls from 1 to .01 over the duration, and the forcing with it.
+# The phase falls from 1 to 0.01 over the duration, and the forcing with it.
 _PHASE_DECAY = math.log(100.0)
 
 
@@ -46,8 +46,8 @@ def dmp_trajectory(
 
     A primitive is a critically damped spring towards the goal, `T^2 y'' = a (a/4 (g + f(x) - y) - T y')`,
     whose rest position a forcing term f moves about: normalised Gaussian bases of the phase x, weighted,
-    times x. The weights are thus in the units of the goal. The phase, one for all, falls from 1 to .01 in
-    a duration: there the movement is within some .025 of the last weights of its goal, and nearly at rest.
+    times x. The weights are thus in the units of the goal. The phase, one for all, falls from 1 to 0.01 in
+    a duration: there the movement is within some 0.025 of the last weights of its goal, and nearly at rest.
     Times scale with the duration, and nothing else does.
 
     Each step is the spring's exact motion under the forcing in its middle: no step is too long.

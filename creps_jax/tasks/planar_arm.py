@@ -61,7 +61,7 @@ def via_point_reaching(
 
     The context is the via-point (x, y), m; theta holds the weights of the DMPs, a row of
     three joints for each of five bases, rad. The goal of the DMPs is the stretched posture. The reward is
-    `-1e4 (|p_50 - v|^2 + |p_100 - (3, 0)|^2) - .5 sum |acceleration|^2`, over 100 steps of .03 s.
+    `-1e4 (|p_50 - v|^2 + |p_100 - (3, 0)|^2) - 0.5 sum |acceleration|^2`, over 100 steps of 0.03 s.
 
     Args:
         low: Lower ends of the via-point's range, m.
@@ -107,7 +107,7 @@ def hole_reaching(
 
     The context is the x of the hole's middle, m; theta holds the weights of the DMPs, a row of three joints
     for each of five bases, and then their goals, rad. The reward is
-    `-1e5 (d^2 + number of steps in collision) - 10 sum |acceleration|^2`, over 100 steps of .03 s. Here d is
+    `-1e5 (d^2 + number of steps in collision) - 10 sum |acceleration|^2`, over 100 steps of 0.03 s. Here d is
     the last distance from the middle of the hole's floor, but after a collision no less than the first one:
     a movement through the ground has reached nothing. So colliding never beats standing still.
 

@@ -48,7 +48,7 @@ __all__ = [
 ]
 
 CONTROL_PERIOD = 0.02
-# Share of the torso's height with straight legs; with the knees bent most it still has .8 of it. Upright
+# Share of the torso's height with straight legs; with the knees bent most it still has 0.8 of it. Upright
 # means within 50 degrees.
 _FALLEN_SHARE = 0.2 / 0.385
 _FALLEN_COSINE = 0.64
@@ -201,7 +201,7 @@ def nao_walk(
 
     Args:
         low: Lowest speed that is asked for, m/s. The default range is that of `NAO`, for any robot; that of
-            another one is the caller's to choose, for `NAO_H25` about .05 to .3, as is the box of theta,
+            another one is the caller's to choose, for `NAO_H25` about 0.05 to 0.3, as is the box of theta,
             for `NAO_H25` `creps_jax.walking.params.NAO_H25_BOUNDS`.
         high: Highest speed that is asked for, m/s; see `low`.
         sample_context: (key) -> context (1 + k,); by default Gaussian about the middle, clipped to the range.

@@ -67,7 +67,7 @@ class BodyPose(NamedTuple):
         hips: Position (x, y, z) and yaw of the middle of the hips.
         left: Position (x, y, z) and yaw of the left sole, below the ankle.
         right: That of the right sole.
-        turn: Share of a turn, -.5 to .5, by which the left foot has turned outwards; the right foot has
+        turn: Share of a turn, -0.5 to 0.5, by which the left foot has turned outwards; the right foot has
             turned by the opposite. It rises while the left foot swings, and falls while the right one does.
     """
 

@@ -38,7 +38,7 @@ _QUICK = SETTINGS["quick"]
 BATCH = _QUICK.trials * _QUICK.samples * _QUICK.repeats
 DURATION = 2.0
 ROUNDS = 5
-# A gait of about .33 m/s.
+# A gait of about 0.33 m/s.
 THETA = (0.001, 0.176, 0.039, 0.224, 3.2, 0.46, 0.31, 0.074, 0.038, 0.11)
 BALANCE = SETTINGS["best"].balance()
 

@@ -7,7 +7,7 @@ derived from it is used.
 
 import numpy as np
 
-# The sole's frame lies under the ankle on the lower face of the foot, a box .02 high.
+# The sole's frame lies under the ankle on the lower face of the foot, a box 0.02 high.
 SOLE_FROM_FOOT = np.array([0.0, -0.03, -0.01])
 # From the simulator's axes to x forward, y left, z up.
 AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -184,7 +184,7 @@ def test_ik_is_continuous_through_the_reach(side):
     poses = jax.vmap(rigid_transform, (None, 0))(jnp.eye(3), positions)
     joints = np.asarray(ik_batch(poses, side)).reshape(20, 7001, 6)
     assert joints[:, 0, 3].max() < -2.0 and joints[:, -1, 3].min() > 0.0  # fully bent, stretched
-    # The knee's steepest slope is 750 rad/m, at the stretched end; a step is .04 mm.
+    # The knee's steepest slope is 750 rad/m, at the stretched end; a step is 0.04 mm.
     assert np.abs(np.diff(joints, axis=1)).max() < 0.04
 
 

@@ -143,7 +143,7 @@ def test_no_substep_is_an_error(make_control_step, model):
 
 
 HINGE = """<mujoco><option integrator="implicitfast" {option}/><worldbody><body><joint name="hinge"/>
-<geom size=".1"/><site name="site"/></body></worldbody><actuator>{actuator}</actuator></mujoco>"""
+<geom size="0.1"/><site name="site"/></body></worldbody><actuator>{actuator}</actuator></mujoco>"""
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ HINGE = """<mujoco><option integrator="implicitfast" {option}/><worldbody><body>
     [
         '<motor name="bad" joint="hinge"/>',
         '<position name="bad" site="site"/>',
-        '<position name="bad" joint="hinge" timeconst=".1"/>',
+        '<position name="bad" joint="hinge" timeconst="0.1"/>',
         '<position name="bad" joint="hinge" gear="2"/>',
     ],
 )

@@ -21,7 +21,7 @@ from creps_jax.tasks.walking import WalkNoise, load_nao, nao_walk, record_walk
 from creps_jax.training import evaluate
 from tests.oracles.walk_c import BALANCE
 
-# A gait of about .33 m/s.
+# A gait of about 0.33 m/s.
 MIDDLE = (0.001, 0.176, 0.039, 0.224, 3.2, 0.46, 0.31, 0.074, 0.038, 0.11)
 STILL = WalkNoise(0.0, 0.0, 0.0)
 G = 9.81
@@ -88,7 +88,7 @@ def test_several_conditions_at_once_each_have_their_value(model):
 
 @pytest.fixture(scope="module")
 def drift():
-    """Return (slope in degrees, payload, push at .1 s) -> a walk of .2 s in which the base only drifts."""
+    """Return (slope in degrees, payload, push at 0.1 s) -> a walk of 0.2 s in which the base only drifts."""
     conditions = (slope(-80.0, 80.0), payload(0.0, 2.0), push(-0.5, 0.5, time=0.1))
     settings = {"duration": 0.2, "noise": STILL, "conditions": conditions, "physics": drifting}
     walk = jax.jit(

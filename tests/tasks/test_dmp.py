@@ -26,7 +26,7 @@ def minimum_jerk(start, goal, num):
 def test_a_movement_ends_near_its_goal_whatever_the_forcing():
     unforced = moved(jnp.zeros_like(WEIGHTS))
     np.testing.assert_allclose(unforced.pos[-1], GOAL, atol=1e-4)
-    # One hundredth of the forcing is left at the end, but the spring lags it by .16 durations.
+    # One hundredth of the forcing is left at the end, but the spring lags it by 0.16 durations.
     assert np.abs(moved().pos[-1] - GOAL).max() < 0.03 * np.abs(WEIGHTS).max()
 
 

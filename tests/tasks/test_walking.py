@@ -17,7 +17,7 @@ from creps_jax.walking.posture import Balance
 from creps_jax.walking.set_points import open_loop_set_points
 from tests.oracles import walk_c
 
-# Gaits of about .08, .33 and .50 m/s, and one that trips at once.
+# Gaits of about 0.08, 0.33 and 0.50 m/s, and one that trips at once.
 SLOW = (0.002, 0.19, 0.02, 0.30, 3.0, 0.3, 0.3, 0.03, 0.015, 0.1)
 MIDDLE = (0.001, 0.176, 0.039, 0.224, 3.2, 0.46, 0.31, 0.074, 0.038, 0.11)
 FAST = (0.0015, 0.161, 0.041, 0.188, -2.295, 0.427, 0.506, 0.090, 0.007, 0.084)
@@ -170,7 +170,7 @@ def test_a_start_up_as_long_as_the_episode_is_an_error(duration, start_up):
 
 def test_another_robot_is_an_error():
     model = mujoco.MjModel.from_xml_string(
-        """<mujoco><worldbody><body><joint name="hinge"/><geom size=".1"/></body></worldbody>
+        """<mujoco><worldbody><body><joint name="hinge"/><geom size="0.1"/></body></worldbody>
         <actuator><position name="a" joint="hinge"/></actuator></mujoco>"""
     )
     with pytest.raises(ValueError, match="hinge"):

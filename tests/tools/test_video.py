@@ -10,8 +10,8 @@ BOX = """
 <mujoco>
   <worldbody>
     <light pos="0 0 3"/>
-    <geom type="plane" size="0 0 .1" rgba=".4 .6 .4 1"/>
-    <body pos="0 0 .3"><freejoint/><geom type="box" size=".1 .1 .3"/></body>
+    <geom type="plane" size="0 0 0.1" rgba="0.4 0.6 0.4 1"/>
+    <body pos="0 0 0.3"><freejoint/><geom type="box" size="0.1 0.1 0.3"/></body>
   </worldbody>
 </mujoco>
 """

@@ -63,7 +63,7 @@ def test_com_agrees_with_a_dense_solve_of_the_zmp_equation():
     ],
 )
 def test_sway_is_that_of_a_pendulum_with_the_right_sign(duration, amplitude, sway):
-    # Computed apart for a height of .265 m and feet at +-.055 m; with g - z'' the last one would be .0091.
+    # Computed apart for a height of 0.265 m and feet at +-0.055 m; with g - z'' the last one would be 0.0091.
     height, height_acc = spring_height(
         PHASE, jnp.float32(0.265), jnp.float32(amplitude), jnp.float32(duration)
     )

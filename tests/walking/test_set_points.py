@@ -22,7 +22,7 @@ from creps_jax.walking.params import WalkParams, params_from_theta
 from creps_jax.walking.set_points import next_set_point, open_loop_set_points
 
 DURATION, PERIOD = 2.0, 0.02
-# A gait of .33 m/s, and one so hasty that joints cannot follow.
+# A gait of 0.33 m/s, and one so hasty that joints cannot follow.
 WALKING = (0.001, 0.176, 0.039, 0.224, 3.2, 0.46, 0.31, 0.074, 0.038, 0.11)
 HASTY = (0.0, 0.15, 0.15, 0.08, -5.0, 0.5, 0.5, 0.15, 0.0, 10.0)
 
