@@ -37,6 +37,8 @@ __all__ = ["Creps", "CrepsInfo", "CrepsSettings", "CrepsState", "creps"]
 _ENOUGH_SAMPLES = 2
 """Samples that the archive should hold for each feature and parameter: with fewer, the test on evidence has
 hardly any degree of freedom left, and the covariance never moves."""
+_DEFAULT_SAMPLES = 5
+"""The same that an archive has by default."""
 _LARGEST = {"coef": 1e36, "cov_chol": checks.LARGEST}
 """The largest numbers of a first policy."""
 _COARSE_REWARDS = 1e-3
@@ -157,7 +159,7 @@ class CrepsSettings(KeepsPrograms):
     kind: Policy
     baseline_features: FeatureMap
     kl_bound: ScalarLike
-    archive_size: int
+    archive_size: int | None
     importance: Importance | None
     significance: float | int | None
 
@@ -190,10 +192,8 @@ class CrepsSettings(KeepsPrograms):
                 # Coefficients are multiplied by small features; squares are taken of the spread.
                 checks.finite(f"policy.{field}", values, largest=_LARGEST[field])
         theta_dim = self._theta_dim(policy)
-        self._check_archive_size(theta_dim)
-        archive = empty_archive(
-            self.archive_size, self.kind.features.context_dim, theta_dim, _precision(policy)
-        )
+        archive_size = self._archive_size(theta_dim)
+        archive = empty_archive(archive_size, self.kind.features.context_dim, theta_dim, _precision(policy))
         importance = self.importance
         history = None if importance is None else empty_history(policy, importance.num_policies)
         return CrepsState(policy, archive, jnp.zeros((), jnp.int32), history)
@@ -277,8 +277,11 @@ class CrepsSettings(KeepsPrograms):
             found = _PROGRAMS[identity] = Programs(settings)
         return found
 
-    def _check_archive_size(self, theta_dim: int) -> None:
+    def _archive_size(self, theta_dim: int) -> int:
+        """Return the size of the archive, after checking that it is not too small."""
         num_fitted, num_baseline = self.kind.features.size + theta_dim, self.baseline_features.size
+        if self.archive_size is None:
+            return _DEFAULT_SAMPLES * max(num_fitted, num_baseline)
         if self.archive_size < num_fitted:
             raise ValueError(
                 f"archive_size must be at least {num_fitted}, features and parameters, "
@@ -297,6 +300,7 @@ class CrepsSettings(KeepsPrograms):
                 f"baseline features, got {self.archive_size}: the policy will hardly move, or move by chance",
                 stacklevel=3,
             )
+        return self.archive_size
 
     def _checked_policy(self, name: str, policy: Any) -> Any:
         """Return a policy in one precision, after checking that it is one of this kind."""
@@ -329,7 +333,7 @@ class CrepsSettings(KeepsPrograms):
         policy = self._checked_policy("state.policy", state.policy)
         checks.instance("state.archive", state.archive, Archive)
         context, theta, reward = state.archive.batch
-        if jnp.shape(reward) != (self.archive_size,):
+        if self.archive_size is not None and jnp.shape(reward) != (self.archive_size,):
             raise ValueError(
                 f"state.archive must have the {self.archive_size} slots of archive_size, "
                 f"got {jnp.shape(reward)}"
@@ -367,7 +371,7 @@ def creps(
     baseline_features: FeatureMap | None = None,
     *,
     kl_bound: ScalarLike = 0.5,
-    archive_size: int,
+    archive_size: int | None = None,
     ridge: float | int | None = None,
     m_step: MStep | None = None,
     importance: Importance | None = None,
@@ -382,9 +386,10 @@ def creps(
             the policy.
         kl_bound: Largest relative entropy epsilon of one update, in nats. Another value compiles nothing
             anew. Inside `jit`, where it cannot be checked, a bound that is not above 0 keeps the policy.
-        archive_size: Number L of the last samples that are learned from. There should be two for each feature
-            and each parameter, and two for each baseline feature: `init` warns of fewer, and refuses less
-            than one, or as few as could all be explained by the baseline.
+        archive_size: Number L of the last samples that are learned from; by default five for each policy
+            feature and parameter, or for each baseline feature if there are more of them. There should be
+            two: `init` warns of fewer, and refuses less than one, or as few as could all be explained by the
+            baseline.
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale; 1e-4 by
             default.
         m_step: How the policy is fitted to the weighted samples: `weighted_ml`, the paper's and the default,

@@ -199,6 +199,19 @@ def test_refuses_an_archive_that_no_policy_could_be_fitted_to():
         algorithm.init(LinearGaussian(jnp.zeros((2, 3)), jnp.eye(3)))
 
 
+def test_the_archive_has_five_samples_a_fitted_number_by_default(key):
+    features, baseline = linear_features(1), quadratic_features(1)
+    start = LinearGaussian(jnp.zeros((2, 3)), jnp.eye(3))
+    assert creps(features, baseline).init(start).archive.batch.reward.shape == (25,)
+    algorithm = creps(features, rbf_features(0.0, 1.0, 12))
+    state = algorithm.init(start)
+    assert state.archive.batch.reward.shape == (60,)
+    contexts = jnp.linspace(0.0, 1.0, 30)[:, None]
+    thetas = algorithm.ask(key, state, contexts)
+    state, info = algorithm.tell(state, Batch(contexts, thetas, thetas[:, 0]))
+    assert int(info.num_valid) == 30
+
+
 @pytest.mark.parametrize("shape", [(1,), (4, 2), (0, 1), (4, 1, 1)])
 def test_refuses_contexts_of_the_wrong_shape(key, state, shape):
     for call in (lambda c: ALGORITHM.ask(key, state, c), lambda c: ALGORITHM.mean(state.policy, c)):
