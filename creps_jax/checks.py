@@ -127,7 +127,7 @@ def grid(name: str, num: Any, dim: int, *, least: int = 1) -> tuple[int, ...]:
         ValueError: If a number is less than `least`, there is not one for each axis, or there are too many
             points.
     """
-    is_one = not isinstance(num, Sequence | np.ndarray) or isinstance(num, str)
+    is_one = not isinstance(num, Sequence | np.ndarray) or isinstance(num, str) or np.ndim(num) == 0
     if is_one:
         nums = (count(name, num, least=least),) * dim
     elif all(isinstance(value, numbers.Integral) and least <= int(value) <= _MOST for value in num):

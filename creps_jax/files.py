@@ -31,8 +31,8 @@ def package_version() -> str:
 def models_folder() -> Path:
     """Return the folder of the robots' models and policies, in the checkout or in the installed package."""
     package = Path(__file__).resolve().parent
-    checkout = package.parent / "models"
-    return checkout if checkout.is_dir() else package / "models"
+    installed = package / "models"
+    return installed if installed.is_dir() else package.parent / "models"
 
 
 def policies_folder(robot: str = "nao") -> Path:

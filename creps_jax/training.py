@@ -135,6 +135,7 @@ def train(
     """
     _check_callback(on_iteration)
     state = start if isinstance(start, SearchState) else algorithm.init(start)
+    _check_state("what init returns", state)
     algorithm.policy(state)  # Refuses the state of another search.
     phases = _phases(task, state, iterations, samples, first_samples, devices)
     chosen = phases[0][0].devices
@@ -190,7 +191,8 @@ def train_trials(
             algorithm.policy(jax.tree.map(lambda leaf, trial=trial: leaf[trial], states))
     else:
         first = algorithm.init(start)
-        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_trials, *x.shape)), first)
+        _check_state("what init returns", first)
+        states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_trials, *jnp.shape(x))), first)
     phases = _phases(task, states, iterations, samples, first_samples, devices)
     setup = phases[0][0]
     if _shares_trials(setup, num_trials):
@@ -361,9 +363,15 @@ def _run(
         for _ in range(length):
             state, log = program(key, state)
             logs.append(jax.tree.map(lambda x: x[None], jax.device_get(log._replace(samples=None))))
-            if on_iteration is not None and on_iteration(state, log) is True:
+            if on_iteration is not None and _is_end(on_iteration(state, log)):
                 return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
     return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
+
+
+def _is_end(answer: Any) -> bool:
+    """Say whether a callback has returned True, as Python, NumPy or jax have it."""
+    is_boolean = isinstance(answer, bool | np.bool_) or getattr(answer, "dtype", None) == np.bool_
+    return is_boolean and bool(answer)
 
 
 def _check_callback(on_iteration: OnIteration | None) -> None:
@@ -375,5 +383,5 @@ def _check_state(name: str, state: Any) -> None:
     """Refuse what is no state; whether it is one of the search, its functions will see."""
     if not isinstance(state, SearchState):
         raise ValueError(
-            f"{name} must be a policy or the state of a search, with iteration, got {checks.shown(state)}"
+            f"{name} must be the state of a search, with a field iteration, got {checks.shown(state)}"
         )

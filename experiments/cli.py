@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, Positional, arg, subcommand
+from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
 
 from creps_jax.errors import UserError
 from creps_jax.tools.command_line import answer, check_seed, say
@@ -26,7 +26,7 @@ Reproduce the figures and tables of the paper, and learn to walk.
   python -m experiments run walk --robot nao_h25  learn it for the real NAO's figures
   python -m experiments run walk --resume         go on with the latest unfinished run
   python -m experiments run walk --help           all settings of an experiment
-  python -m experiments run all                   the paper's Figures 5 to 8, half an hour
+  python -m experiments run all                   the paper's Figures 5 to 9, half an hour
   python -m experiments plot walk                 draw the figures of the latest results again
   python -m experiments check                     hold the latest results against the paper
 
@@ -54,7 +54,7 @@ class Run:
     """Run an experiment; `run NAME --help` shows its settings, which are options too.
 
     Attributes:
-        name: The experiment, or "all" for the paper's Figures 5 to 8.
+        name: The experiment, or "all" for the paper's Figures 5 to 9.
         preset: Settings to begin with; each experiment's first preset by default.
         config: The manifest.json of an earlier run, whose settings and seed to begin with instead.
         seed: Seed of all random numbers; 0 by default.
@@ -137,7 +137,7 @@ def _refuse(why: str) -> int:
 
 def _list(_: List) -> int:
     width = max(map(len, registry.DESCRIPTIONS))
-    every = {**registry.DESCRIPTIONS, registry.ALL: f"run {', '.join(registry.FIGURES)} (Figures 5 to 8)"}
+    every = {**registry.DESCRIPTIONS, registry.ALL: f"run {', '.join(registry.FIGURES)} (Figures 5 to 9)"}
     for name, description in every.items():
         print(f"{name:{width}}  {description}")
     return 0
@@ -147,13 +147,15 @@ def _run(name: str, arguments: list[str]) -> int:
     if name == registry.ALL:
         return _run_all(arguments)
     registry.check_name(name)
-    if "--speed" in arguments:
+    if any(word == "--speed" or word.startswith("--speed=") for word in arguments):
         raise UserError(
             "--speed is no setting of an experiment; to watch a walk: "
             "`python -m creps_jax.tools play --speed M/S`"
         )
     early = _early_options(arguments)
     if early.distributed:
+        if early.out is None:
+            raise UserError("processes that share a run need --out, a folder that all of them see")
         join_processes()
     import_mjx_quietly()
     from rich.console import Console
@@ -206,7 +208,7 @@ def _options_and_settings(
         "RunWithSettings",
         [
             *((field, kind, dataclasses.field(default=each.default)) for field, kind, each in fields),
-            ("settings", OmitArgPrefixes[experiment.Settings], dataclasses.field(default=default)),  # type: ignore[name-defined]
+            ("settings", Annotated[experiment.Settings, arg(name="")], dataclasses.field(default=default)),
         ],
         frozen=True,
     )

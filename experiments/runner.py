@@ -14,6 +14,8 @@ from rich.console import Console
 from creps_jax import files
 from creps_jax.errors import UserError
 from creps_jax.tools import folder_lock, plots, results
+from creps_jax.tools.command_line import check_seed
+from creps_jax.tools.session import plain
 from creps_jax.tools.tables import to_markdown
 from experiments import registry
 from experiments.learning import Session
@@ -271,6 +273,9 @@ def _resolved(request: Request) -> tuple[Any, int]:
     _check_counts(settings)
     if seed is None and request.config is not None:
         seed = results.load_manifest_file(request.config).get("seed")
+        if not isinstance(seed, int):
+            raise UserError(f"{request.config} must have a whole number as seed, got {seed!r}")
+        check_seed(seed)
     return settings.resolved() if hasattr(settings, "resolved") else settings, seed or 0
 
 
@@ -300,8 +305,8 @@ def _resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Pa
 def _settings_of(experiment: registry.Experiment, path: Path, manifest: Mapping[str, Any]) -> Any:
     """Return the settings that a manifest holds."""
     try:
-        return experiment.Settings(**_as_tuples(manifest["settings"]))
-    except TypeError as error:
+        return plain.read(experiment.Settings, manifest["settings"], "settings")
+    except UserError as error:
         raise UserError(f"{path} was made with other settings than this version has: {error}") from error
 
 
@@ -323,9 +328,9 @@ def _identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
     """Return what has to agree for a checkpoint to belong to a run: all but how long it goes on."""
     same = {key: value for key, value in dataclasses.asdict(settings).items() if key != "iterations"}
     # Checkpoints from before there was a choice of robots, or of a first policy, do not name one.
-    for name, default in (("robot", _PAPERS_ROBOT), ("start_policy", None)):
-        if name in same and same[name] == default:
-            del same[name]
+    for setting, default in (("robot", _PAPERS_ROBOT), ("start_policy", None)):
+        if setting in same and same[setting] == default:
+            del same[setting]
     return {"experiment": name, "seed": seed, "settings": same}
 
 
@@ -371,10 +376,3 @@ def _latest_finished(name: str) -> Path:
     if folder is None:
         raise UserError(f"there are no results of {name} in {results.default_root()}; run it first")
     return folder
-
-
-def _as_tuples(value: Any) -> Any:
-    """Turn the lists that JSON made of tuples back."""
-    if isinstance(value, dict):
-        return {name: _as_tuples(entry) for name, entry in value.items()}
-    return tuple(_as_tuples(entry) for entry in value) if isinstance(value, list) else value

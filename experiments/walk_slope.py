@@ -127,12 +127,14 @@ def walk_everywhere(settings: Settings, key: jax.Array, policy: LinearGaussian) 
 
 
 def warm_start(settings: Settings) -> LinearGaussian:
-    """Return the policy to begin with: on every slope, as near as the features allow, the shipped one.
+    """Return the policy to begin with: on every slope, as near as the features allow, one of the speed alone.
+
+    That is `start_policy`, by default the shipped one.
 
     Raises:
         UserError: if it keeps its parameters within other bounds.
     """
-    path = policies_folder() / "walk.npz"
+    path = Path(settings.start_policy or policies_folder() / "walk.npz")
     shipped = load(path)
     space = shipped.parameters
     if (space.constraint, space.low, space.high) != (settings.constraint, *settings.box()):

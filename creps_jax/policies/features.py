@@ -64,10 +64,16 @@ class FeatureMap(NamedTuple):
             ValueError: If a context has not `context_dim` variables.
         """
         contexts = checks.array("contexts", contexts)
+        if contexts.ndim < 1 or contexts.shape[-1] != self.context_dim:
+            raise ValueError(
+                f"contexts must have {self.context_dim} variables along the last axis, got {contexts.shape}"
+            )
         apply = self.apply
         for _ in range(contexts.ndim - 1):
             apply = jax.vmap(apply)
-        return apply(contexts)
+        features = apply(contexts)
+        shape = (*contexts.shape[:-1], self.size)
+        return checks.finite("features", checks.array("features", features, shape), largest=math.inf)
 
 
 @checks.arguments
@@ -205,10 +211,12 @@ def describe(features: FeatureMap) -> dict[str, Any]:
     """
     for kind, functions in _KINDS.items():
         if isinstance(features.apply, functions):
-            return {"kind": kind, **vars(features.apply)}
+            description = {"kind": kind, **vars(features.apply)}
+            if from_description(description) == features:
+                return description
     if features.name is None:
         raise ValueError(
-            "features of your own must have a name to be saved, FeatureMap(..., name='mine'), "
+            "features of your own must have a name, FeatureMap(..., name='mine'), to be saved or exported, "
             f"got {checks.shown(features)}"
         )
     return {"kind": "own", "name": features.name, "size": features.size, "dim": features.context_dim}

@@ -14,6 +14,7 @@ from creps_jax import checks
 from creps_jax.errors import UserError
 from creps_jax.files import load_arrays, save_arrays
 from creps_jax.policies import features as feature_maps
+from creps_jax.policies import gaussian
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.gaussian import LinearGaussian
@@ -62,26 +63,26 @@ class Learned:
             ("task", Mapping),
         ):
             checks.instance(name, getattr(self, name), kind)
-        try:
-            with np.errstate(over="ignore", invalid="ignore"):
-                coef, cov_chol = (np.asarray(values, np.float32) for values in self.policy)
-        except (TypeError, ValueError):
-            raise ValueError(f"policy must be arrays of numbers, got {checks.shown(self.policy)}") from None
-        size = self.parameters.size
-        wanted = (self.features.size, size), (size, size)
-        if (coef.shape, cov_chol.shape) != wanted:
+        policy = gaussian.checked("policy", self.policy, self.features)
+        if policy.coef.shape[1] != self.parameters.size:
             raise ValueError(
-                f"policy must have coef {wanted[0]} and cov_chol {wanted[1]}, "
-                f"got {coef.shape} and {cov_chol.shape}"
+                f"policy must have a column of coef for each of {', '.join(self.parameters.names)}, "
+                f"got coef {policy.coef.shape}"
             )
-        if not (np.isfinite(coef).all() and np.isfinite(cov_chol).all()):
-            raise ValueError("policy must be finite, got numbers that are not")
         if self.features.context_dim != self.contexts.size:
             raise ValueError(
                 f"features must be of the contexts {', '.join(self.contexts.names)}, "
                 f"got {self.features.context_dim} variables"
             )
-        object.__setattr__(self, "policy", LinearGaussian(jnp.asarray(coef), jnp.asarray(cov_chol)))
+        single = (checks.converted(values, np.dtype(np.float32)) for values in policy)
+        object.__setattr__(self, "policy", gaussian.checked("policy", LinearGaussian(*single), self.features))
+        try:
+            task = json.loads(json.dumps(dict(self.task)))
+        except (TypeError, ValueError) as error:
+            raise ValueError(
+                f"task must be plain values, as JSON has them, got {self.task}: {error}"
+            ) from None
+        object.__setattr__(self, "task", task)
 
     def __call__(self, *context: Any) -> dict[str, float]:
         """Return the parameters for a context, by name, in their units and within their bounds.
@@ -110,7 +111,7 @@ class Learned:
             ValueError: As calling does.
         """
         numbers = jnp.asarray(self.contexts.checked(context), jnp.float32)
-        return np.asarray(self.features.apply(numbers)) @ np.asarray(self.policy.coef)
+        return np.asarray(self.features(numbers)) @ np.asarray(self.policy.coef)
 
     def in_range(self, *context: Any) -> bool:
         """Say whether a context is within the range that the policy was learned for.
@@ -194,7 +195,7 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
         )
     except KeyError as error:
         raise UserError(f"{file} is an incomplete policy file: it has no {error}") from error
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{file}: {error}") from error
 
 
@@ -206,9 +207,11 @@ def _space(
 
 
 def _features(
-    description: dict[str, Any], context_range: tuple[list[float], list[float]], own: FeatureMap | None
+    description: Any, context_range: tuple[list[float], list[float]], own: FeatureMap | None
 ) -> FeatureMap:
     """Make the features of a file; those of version 2 are over the range of the contexts."""
+    if not isinstance(description, dict):
+        raise ValueError(f"features must be described by an object, got {description!r}")
     if description.get("kind") == "rbf" and "low" not in description:
         return Features(**description).make(*context_range)
     if description.get("kind") == "linear" and "dim" not in description:

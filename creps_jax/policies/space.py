@@ -48,6 +48,8 @@ class Space:
 
     def __post_init__(self) -> None:
         """Check the fields, and turn sequences into tuples."""
+        if not isinstance(self.names, str | tuple | list):
+            raise ValueError(f"names must be a sequence of texts, got {checks.shown(self.names)}")
         names = (self.names,) if isinstance(self.names, str) else tuple(self.names)
         units = (self.units,) if isinstance(self.units, str) else tuple(self.units)
         low, high = (self._ends(side, len(names)) for side in ("low", "high"))
@@ -66,30 +68,22 @@ class Space:
         object.__setattr__(self, "high", high)
         if self.constraint not in CONSTRAINTS:
             raise ValueError(f"constraint must be one of {', '.join(CONSTRAINTS)}, got {self.constraint!r}")
-        if self.constraint == "sigmoid" and not all(map(math.isfinite, (*low, *high))):
-            raise ValueError(f"low and high must be finite for a sigmoid, got {low} and {high}")
-
-    @classmethod
-    def unnamed(cls, name: str, size: int) -> "Space":
-        """Return the space of so many variables of which nothing is known: `name_0`, `name_1` and so on."""
-        return cls(tuple(f"{name}_{i}" for i in range(size)), (-math.inf,) * size, (math.inf,) * size)
+        if self.constraint == "sigmoid" and not all(abs(end) <= checks.FLOAT32_MAX for end in (*low, *high)):
+            raise ValueError(f"low and high must be finite in float32 for a sigmoid, got {low} and {high}")
 
     @property
     def size(self) -> int:
         """The number of variables."""
         return len(self.names)
 
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Each name with its unit, such as `speed (m/s)`."""
-        pairs = zip(self.names, self.units, strict=True)
-        return tuple(f"{name} ({unit})" if unit else name for name, unit in pairs)
-
     def inside(self, free: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
         """Turn numbers that a search draws freely into parameters inside the bounds.
 
         Source: Abdolmaleki et al. 2016, Eq. 17, for a sigmoid.
         """
+        free = checks.array("free", free)
+        if free.shape[-1:] != (self.size,):
+            raise ValueError(f"free must have {self.size} numbers along its last axis, got {free.shape}")
         if self.constraint == "sigmoid":
             return sigmoid_gate(free, self.low, self.high)
         if self.constraint == "clip":
@@ -129,7 +123,7 @@ class Space:
         if found is not None:
             low, high, unit = self.low[found], self.high[found], self.units[found]
             raise UserError(
-                f"{self.names[found]} must be within the learned range, {low:g} to {high:g} {unit}, "
+                f"{self.names[found]} must be within its range, {low:g} to {high:g} {unit}, "
                 f"got {numbers[found]}".replace(" ,", ",")
             )
         return numbers

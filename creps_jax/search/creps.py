@@ -306,7 +306,13 @@ class CrepsSettings(KeepsPrograms):
         """Return a policy in one precision, after checking that it is one of this kind."""
         if self.kind.checked is not None:
             return self.kind.checked(name, policy, self.kind.features)
-        return jax.tree.map(lambda leaf: checks.finite(name, checks.array(name, leaf)), policy)
+        leaves = jax.tree.leaves(policy)
+        if not any(jnp.issubdtype(jnp.result_type(leaf), jnp.floating) for leaf in leaves):
+            raise ValueError(f"{name} must be a pytree of arrays with floats, got {checks.shown(policy)}")
+        for leaf in leaves:
+            if jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+                checks.finite(name, checks.array(name, leaf))
+        return jax.tree.map(jnp.asarray, policy)
 
     def _theta_dim(self, policy: Any) -> int:
         features = jnp.zeros((1, self.kind.features.size), _precision(policy))
@@ -402,7 +408,7 @@ def creps(
             whatever the evidence, as in the paper, and loses the exploration to noise.
 
     Returns:
-        The algorithm, with the functions `init`, `ask`, `tell` and `mean`.
+        The algorithm, with the functions `init`, `ask`, `tell`, `policy` and `mean`.
 
     Raises:
         ValueError: If a setting is out of its range, or the features are of different contexts.
@@ -441,6 +447,9 @@ def _kind(given: FeatureMap | Policy, ridge: float | int | None, m_step: MStep |
     if isinstance(given, Policy):
         if ridge is not None or m_step is not None:
             raise ValueError(f"ridge and m_step must be None for a Policy, got {ridge} and {m_step}")
+        checks.instance("policy_features.features", given.features, FeatureMap)
+        for name in ("mean", "sample", "log_prob", "kl", "entropy", "fit"):
+            checks.function(f"policy_features.{name}", getattr(given, name), "see Policy")
         return given
     m_step = weighted_ml if m_step is None else m_step
     if m_step is bounded_ml:
@@ -576,7 +585,8 @@ def _mean_over(values: Array, is_valid: Array) -> Scalar:
 
 def _precision(policy: Any) -> Any:
     """Return the precision of a policy's arrays."""
-    return jnp.result_type(*jax.tree.leaves(policy))
+    leaves = [jnp.result_type(leaf) for leaf in jax.tree.leaves(policy)]
+    return jnp.result_type(*(dtype for dtype in leaves if jnp.issubdtype(dtype, jnp.floating)))
 
 
 def _effective_samples(weights: Array) -> Scalar:

@@ -99,7 +99,8 @@ def check_outcome(outcome: Any) -> Any:
         ValueError: If it is neither.
     """
     if not isinstance(outcome, Outcome):
-        if not isinstance(outcome, jax.Array | np.ndarray | float | int) or isinstance(outcome, bool):
+        is_number = isinstance(outcome, jax.Array | np.ndarray | np.number | float | int)
+        if not is_number or isinstance(outcome, bool):
             raise ValueError(
                 "a rollout must return a reward, or an Outcome, a NamedTuple with reward and violation such "
                 f"as PlainOutcome, got {checks.shown(outcome)}"

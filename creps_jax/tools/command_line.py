@@ -40,8 +40,10 @@ def _is_refused_by_the_library(error: ValueError) -> bool:
     traceback = error.__traceback__
     while traceback is not None and traceback.tb_next is not None:
         traceback = traceback.tb_next
-    library = Path(__file__).parents[1]
-    return traceback is not None and Path(traceback.tb_frame.f_code.co_filename).is_relative_to(library)
+    if traceback is None:
+        return False
+    place, tools = Path(traceback.tb_frame.f_code.co_filename), Path(__file__).parent
+    return place.is_relative_to(tools.parent) and not place.is_relative_to(tools)
 
 
 def check_seed(seed: int | None) -> None:

@@ -143,6 +143,25 @@ def test_settings_of_another_version_are_named(tiny):
         run(out=folder, resume=True)
 
 
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"seed": "x"}, "must have a whole number as seed, got 'x'"),
+        ({"seed": -3}, "seed must be from 0 to"),
+        ({"settings": {"iterations": "5"}}, "other settings .* iterations must be a whole number, got '5'"),
+        ({"settings": {"speeds": None}}, "other settings .* speeds must be a list, got None"),
+        ({"experiment": "walk"}, r"manifest\.json is of 'walk', expected 'tiny'"),
+    ],
+)
+def test_a_manifest_that_no_run_has_written_is_refused(tiny, changes, match):
+    folder = run(changes={"iterations": 1}, out=Path("done"))
+    path = folder / "manifest.json"
+    path.write_text(json.dumps({**results.load_manifest(folder), **changes}))
+    with pytest.raises(UserError, match=match):
+        run(config=path, out=Path("new"))
+    assert not Path("new").exists()
+
+
 def test_plot_and_check_use_the_latest_results(tiny, capsys):
     assert main(["plot", "tiny"]) == 2
     folder = run(changes={"iterations": 1})

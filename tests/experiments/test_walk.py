@@ -32,6 +32,7 @@ from creps_jax.walking.params import (
 )
 from creps_jax.walking.posture import Balance
 from experiments import fig11_walk, runner, walk
+from experiments.cli import main
 
 SHIPPED = shipped_policy()
 
@@ -171,7 +172,7 @@ def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
     settings = walk.SETTINGS["quick"]
     walk.as_learned(settings, walk.first_policy(settings)).save(Path("p.npz"))
     assert tools(["play", "--speed", "0.9", "--policy", "p.npz"]) == 2
-    assert "within the learned range, 0.1 to 0.6 m/s, got 0.9" in capsys.readouterr().err
+    assert "within its range, 0.1 to 0.6 m/s, got 0.9" in capsys.readouterr().err
     assert tools(["play", "--speed", "0.5", "--policy", "p.npz"]) == 0
 
 
@@ -204,6 +205,13 @@ def test_the_first_policy_is_the_same_for_every_speed(kind):
     policy = walk.as_learned(settings, walk.first_policy(settings))
     for speed in (0.1, 0.25, 0.6):
         np.testing.assert_allclose(policy.mean(speed), np.full(10, -0.5), rtol=1e-5)
+
+
+def test_settings_within_settings_are_options(bench):
+    options = ["--features.num-centers", "7", "--kl-bound", "1", "--iterations", "1", "--trials", "1"]
+    assert main(["run", "walk", *options, "--out", "seven"]) == 0
+    kept = results.load_manifest(Path("seven"))["settings"]
+    assert (kept["features"]["num_centers"], kept["kl_bound"]) == (7, 1.0)
 
 
 def test_a_run_can_go_on_from_a_policy(tmp_path):
@@ -358,7 +366,8 @@ def test_a_run_from_before_robots_can_be_resumed(bench, physics):
     begin = runner.default_settings(walk, "walk", resume=True)
     resumed, _, manifest = runner._resumed(walk, runner.Request("walk", begin, resume=True))
     del settings["iterations"]
-    assert runner._identity("walk", resumed, manifest["seed"])["settings"] == settings
+    identity = runner._identity("walk", resumed, manifest["seed"])
+    assert (identity["experiment"], identity["settings"]) == ("walk", settings)
     assert resumed.physics == physics and resumed.robot == "nao"
 
 

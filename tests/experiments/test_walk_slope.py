@@ -120,7 +120,7 @@ def test_films_show_each_walk_on_its_slope(settings, monkeypatch):
     captions = [clip.caption for clip in clips]
     assert captions[0] == "slope 2°, asked 0.20 m/s, reached 0.20 m/s"
     assert captions[1] == "slope -4°, asked 0.30 m/s, reached -0.40 m/s"
-    with pytest.raises(UserError, match="slope must be within the learned range, -10 to 10 deg, got 12"):
+    with pytest.raises(UserError, match="slope must be within its range, -10 to 10 deg, got 12"):
         play.record(policy, (0.2,), seed=0, slopes=(12.0,))
 
 

@@ -69,7 +69,7 @@ def test_a_policy_comes_back_as_it_was_saved(tmp_path, name):
 
 def test_features_of_a_user_need_a_name_and_come_along(tmp_path):
     path = tmp_path / "policy.npz"
-    with pytest.raises(ValueError, match=r"must have a name to be saved, FeatureMap\(\.\.\., name='mine'\)"):
+    with pytest.raises(ValueError, match=r"must have a name, FeatureMap\(\.\.\., name='mine'\)"):
         make_policy(FeatureMap(cubic, 2, 1)).save(path)
     make_policy(CUBIC).save(path)
     for wrong in (None, linear_features(1), FeatureMap(cubic, 2, 1, name="other")):
@@ -104,7 +104,7 @@ def test_parameters_of_other_constraints():
 
 @pytest.mark.parametrize("context", [0.09, 0.7, -1.0, float("nan"), float("inf")])
 def test_a_context_outside_the_learned_range_is_refused_and_can_be_asked_for(context):
-    with pytest.raises(ValueError, match=r"speed must be within the learned range, 0\.1 to 0\.6 m/s, got"):
+    with pytest.raises(ValueError, match=r"speed must be within its range, 0\.1 to 0\.6 m/s, got"):
         make_policy()(context)
     assert not make_policy().in_range(context)
     assert make_policy().in_range(0.6)
@@ -123,7 +123,7 @@ def test_several_context_variables_each_have_a_range():
     parameters = dataclasses.replace(WALK, constraint="none")
     policy = Learned(LinearGaussian(coef, jnp.eye(2)), linear_features(2), contexts, parameters)
     np.testing.assert_allclose(policy.theta(0.5, -3.0), [1.7, -3.0], rtol=1e-6)
-    with pytest.raises(ValueError, match=r"slope must be within the learned range, -5 to 5 deg, got 6"):
+    with pytest.raises(ValueError, match=r"slope must be within its range, -5 to 5 deg, got 6"):
         policy.theta(0.5, 6.0)
     with pytest.raises(ValueError, match=r"a number for each of speed, slope, got 0\.5"):
         policy.theta(0.5)
@@ -140,6 +140,9 @@ def damaged(arrays: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
         "constraint": {"constraint": "hope"},
         "kind": {"features": json.dumps({"kind": "cubic"})},
         "no json": {"features": "{"},
+        "no object": {"features": "[1]"},
+        "null": {"features": "null"},
+        "spread of zero": {"cov_chol": np.zeros_like(arrays["cov_chol"])},
         "range": {"context_range": np.array([[0.1], [np.nan]])},
         "reversed": {"param_bounds": arrays["param_bounds"][::-1]},
         "no context": {"context_names": np.array([], "U1")},
@@ -161,14 +164,41 @@ def test_what_is_no_policy_is_not_loaded(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"policy": LinearGaussian(jnp.zeros((3, 2)), jnp.eye(2))}, r"coef \(4, 2\) .* got \(3, 2\)"),
-        ({"policy": LinearGaussian(jnp.full((4, 2), jnp.nan), jnp.eye(2))}, "policy must be finite"),
+        ({"policy": LinearGaussian(jnp.zeros((3, 2)), jnp.eye(2))}, r"coef \(4, d\)"),
+        ({"policy": LinearGaussian(jnp.full((4, 2), jnp.nan), jnp.eye(2))}, "policy.coef must be finite"),
         ({"contexts": Space(("x", "y"), (0, 0), (1, 1))}, "features must be of the contexts x, y, got 1"),
     ],
 )
 def test_fields_that_do_not_fit_each_other_are_refused(changes, match):
     with pytest.raises(ValueError, match=match):
         dataclasses.replace(make_policy(), **changes)
+
+
+def test_a_task_is_kept_as_json_has_it(tmp_path):
+    policy = dataclasses.replace(make_policy(), task={"name": "walk", "tuple": (1, 2), 3: None})
+    assert policy.task == {"name": "walk", "tuple": [1, 2], "3": None}
+    policy.save(tmp_path / "p.npz")
+    assert_same(load(tmp_path / "p.npz"), policy)
+    with pytest.raises(ValueError, match="task must be plain values, as JSON has them"):
+        dataclasses.replace(policy, task={"gain": np.float32(1.0)})
+
+
+def test_features_that_do_not_fit_their_numbers_are_named():
+    wrong = FeatureMap(lambda context: jnp.ones(3), 2, 1, name="wrong")
+    with pytest.raises(ValueError, match=r"features must have shape \(2,\), got \(3,\)"):
+        make_policy(wrong)(0.3)
+    with pytest.raises(ValueError, match="features must be numbers, got nan"):
+        make_policy(FeatureMap(lambda context: jnp.full(2, jnp.nan), 2, 1, name="nan"))(0.3)
+    with pytest.raises(ValueError, match=r"contexts must have 1 variables along the last axis, got \(4, 3\)"):
+        CUBIC(jnp.ones((4, 3)))
+
+
+def test_library_features_with_other_fields_are_ones_own(tmp_path):
+    scaled = RBF._replace(scale=(2.0,) * 4)
+    with pytest.raises(ValueError, match="must have a name"):
+        make_policy(scaled).save(tmp_path / "p.npz")
+    make_policy(scaled._replace(name="scaled")).save(tmp_path / "p.npz")
+    assert load(tmp_path / "p.npz", features=scaled._replace(name="scaled")).features.scale == (2.0,) * 4
 
 
 def test_a_policy_file_is_named_as_what_it_is(tmp_path):

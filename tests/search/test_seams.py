@@ -1,5 +1,6 @@
 """A search and a policy of a user's own, in a few lines each, are trained as the library's are."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -117,8 +118,26 @@ def test_what_does_not_go_with_a_policy_of_ones_own_is_named():
         cj.creps(network_policy(), archive_size=400, significance=None, ridge=0.1)
 
 
-def test_a_callback_can_end_a_run(key):
-    stop = lambda state, log: int(state.iteration) == 3  # noqa: E731
+def test_a_search_whose_state_has_no_iteration_is_named(key):
+    search = dataclasses.replace(random_search(), init=lambda policy: policy)
+    for learn, keys in ((cj.train, key), (cj.train_trials, jax.random.split(key, 2))):
+        with pytest.raises(ValueError, match="what init returns must be the state of a search, with a field"):
+            learn(keys, TASK, search, jnp.zeros(1), iterations=1, samples=8)
+
+
+def test_parts_of_a_policy_that_are_none_are_named():
+    policy = network_policy()
+    for field, value in (("mean", 3), ("features", None), ("fit", None)):
+        with pytest.raises(ValueError, match=rf"policy_features\.{field} must be"):
+            cj.creps(policy._replace(**{field: value}), archive_size=400, significance=None)
+    algorithm = cj.creps(policy, archive_size=400, significance=None)
+    with pytest.raises(ValueError, match="policy must be a pytree of arrays with floats, got None"):
+        algorithm.init(None)
+
+
+@pytest.mark.parametrize("kind", [bool, np.bool_, jnp.bool_])
+def test_a_callback_can_end_a_run(key, kind):
+    stop = lambda state, log: kind(int(state.iteration) == 3)  # noqa: E731
     search = random_search()
     state, log = cj.train(key, TASK, search, jnp.zeros(1), iterations=9, samples=8, on_iteration=stop)
     assert int(state.iteration) == 3 and log.mean_reward.shape == (3,)
