@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from creps_jax.policies.features import FeatureMap
-from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.search.creps import Creps, creps
 from creps_jax.search.fit import fit_within
 from creps_jax.search.importance import Importance
@@ -86,8 +86,7 @@ def make_contender(
         significance=settings.significance,
         importance=None if settings.importance_policies is None else Importance(settings.importance_policies),
     )
-    dim = task.theta_dim
-    start = LinearGaussian(jnp.zeros((features[0].size, dim)), settings.start_std * jnp.eye(dim))
+    start = start_policy(features[0], task.theta_dim, std=settings.start_std)
     return Contender(task, algorithm, start)
 
 

@@ -17,7 +17,7 @@ from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.errors import UserError
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import quadratic_features
-from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.policies.learned import Learned
 from creps_jax.policies.space import Space, sigmoid_gate
 from creps_jax.search.creps import Creps, CrepsState, creps
@@ -387,7 +387,7 @@ def first_policy(settings: Settings) -> LinearGaussian:
         if (learned.features, learned.parameters) != wanted:
             raise UserError(f"{settings.start_policy} has other features or bounds than these settings")
         return learned.policy
-    num_features = settings.features.make(*settings.context_range()).size
+    features = settings.features.make(*settings.context_range())
     mean, std = (
         jnp.full(len(PARAM_NAMES), settings.start_mean),
         jnp.full(len(PARAM_NAMES), settings.start_std),
@@ -396,10 +396,7 @@ def first_policy(settings: Settings) -> LinearGaussian:
         low, high = (jnp.asarray(bound) for bound in settings.box())
         mean, slope = jax.jvp(lambda free: sigmoid_gate(free, low, high), (mean,), (jnp.ones_like(mean),))
         std = slope * std
-    coef = jnp.tile(mean, (num_features, 1))
-    if settings.features.kind == "linear":
-        coef = coef.at[1:].set(0.0)
-    return LinearGaussian(coef, jnp.diag(std))
+    return start_policy(features, len(PARAM_NAMES), mean=mean, std=std)
 
 
 def evaluate_trials(

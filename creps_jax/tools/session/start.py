@@ -11,7 +11,7 @@ import numpy as np
 from creps_jax.errors import UserError
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import FeatureMap, describe
-from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.policies.learned import Learned
 from creps_jax.policies.space import Space
 from creps_jax.tools.session.plain import shortest
@@ -126,10 +126,8 @@ def _start(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
         # The slope of the sigmoid makes the spread, to first order, that of the parameters.
         share = (start - low) / (high - low)
         start, spread = np.log(share / (1 - share)), spread / ((high - low) * share * (1 - share))
-    coef = np.tile(start, (feature_map(settings).size, 1))
-    if settings.features.kind == "linear":
-        coef[1:] = 0.0
-    return coef, np.diag(spread)
+    policy = start_policy(feature_map(settings), len(settings.parameters), mean=start, std=spread)
+    return np.asarray(policy.coef), np.asarray(policy.cov_chol)
 
 
 def feature_map(settings: Settings) -> FeatureMap:
