@@ -18,7 +18,14 @@ if not notebooks.is_symlink():
 
 project = "creps_jax"
 copyright = "the creps_jax authors"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "as_written"]
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "as_written",
+]
 # MyST-NB puts what notebooks show beside the folder of the pages.
 exclude_patterns = ["_build", "jupyter_execute"]
 # Dashes, but no curly quotes: "phi' w" is mathematics.
@@ -44,9 +51,9 @@ nb_merge_streams = True
 # A notebook that complains fails the build.
 nb_output_stderr = "error"
 
-html_theme_options = {
-    "description": "Contextual policy search for robots, in JAX",
-    # Wide enough for the lines of signatures and programs.
-    "page_width": "1240px",
-    "body_max_width": "none",
-}
+html_theme = "furo"
+html_title = "creps_jax"
+html_static_path = ["static"]
+html_css_files = ["wrap.css"]
+copybutton_prompt_text = r">>> |\.\.\. "
+copybutton_prompt_is_regexp = True
