@@ -208,7 +208,9 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
         column[4].plot(seen["time"], roll, label="roll")
         column[4].plot(seen["time"], yaw, label="heading")
         column[4].axvspan(end - WINDOW, end, color=plots.PAPER_COLOUR, alpha=0.2, lw=0)
-        column[4].set_xlabel("time (s)")
+        # One scale for both, though one of the walks ends in a fall.
+        column[4].set_xlim(0.0, max(arrays[f"{each}.time"][-1] for each in GAITS))
+        column[4].set_xlabel("time (s); the grey part is shown above")
     for row, label in zip(
         axes[:, 0],
         (
