@@ -49,9 +49,9 @@ class LearnerSettings:
         archive_size: L, samples kept.
         kl_bound: epsilon, nats.
         ridge: relative penalty on the policy's coefficients.
-        mean_kl_bound: how far an update may move the policy's mean, nats, see `bounded_ml`; None is the
-            paper's unbounded fit.
-        cov_kl_bound: how far it may move the covariance, nats.
+        mean_kl_bound: bound on the change of the policy's mean in an update, nats, see `bounded_ml`; None
+            is the paper's unbounded fit.
+        cov_kl_bound: the same for the covariance, nats.
         start_std: standard deviation of the first policy, whose mean is zero.
         significance: p-value from which on the covariance stays, see `creps_jax.creps`; None is the paper's
             update, which moves it whatever the evidence.

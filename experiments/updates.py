@@ -47,7 +47,7 @@ THETA_DIM, CONTEXT_DIM = 20, 2
 SIGNIFICANCE = 0.1
 """Of the evidence that the bounded fits ask for; weighted ML is the paper's, which asks for none."""
 FUNCTION_KL_BOUNDS = (1.0, 0.05)
-"""How far an update of the bounded fit may move mean and covariance on the functions, nats."""
+"""Bounds of the bounded fit on the change of mean and covariance on the functions, nats."""
 
 
 @dataclasses.dataclass(frozen=True)

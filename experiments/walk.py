@@ -89,15 +89,15 @@ class Settings:
         repeats: rollouts of a sample, averaged.
         archive_size: L, samples kept.
         kl_bound: epsilon, nats.
-        mean_kl_bound: how far an update may move the policy's mean, nats, see `bounded_ml`; None is the
-            paper's unbounded fit.
-        cov_kl_bound: how far it may move the covariance, nats.
+        mean_kl_bound: bound on the change of the policy's mean in an update, nats, see `bounded_ml`; None
+            is the paper's unbounded fit.
+        cov_kl_bound: the same for the covariance, nats.
         significance: p-value from which on the covariance stays, see `creps_jax.creps`; None is the paper's
             update.
         features: kind, number and width of the policy's features.
-        bounds: which box the parameters are kept in, a name in BOUNDS; None is the robot's own.
-        constraint: how they are, a name in CONSTRAINTS: squashed by a sigmoid, or by a penalty of the reward.
-        start_mean: mean of the first policy before squashing; 0 is the middle of the box.
+        bounds: bounds of the parameters, a name in BOUNDS; None is the robot's own.
+        constraint: how they are held, a name in CONSTRAINTS: by a sigmoid, or by a penalty of the reward.
+        start_mean: mean of the first policy before squashing; 0 is the middle of the bounds.
         start_std: its standard deviation before squashing. With a penalty the first policy is, to first
             order, the same.
         start_policy: policy file to go on from, in place of start_mean and start_std; it must have the same
@@ -107,7 +107,7 @@ class Settings:
         duration: length of an episode of the evaluation, s.
         learning_duration: length of an episode in learning, s.
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
-        placement_gain: how far a landing foot is put out to where the robot tips over, see `Balance`; 0 is
+        placement_gain: how far the landing foot shifts towards the side of the tilt, see `Balance`; 0 is
             the paper's engine.
         sampler: how contexts are drawn in learning, a name in SAMPLERS.
         margin: how far beyond both ends of the range contexts are drawn in learning, m/s: the ends are
@@ -174,11 +174,11 @@ class Settings:
         return find_walker(self.robot)
 
     def box(self) -> Bounds:
-        """Return the box that the parameters are kept in."""
+        """Return the bounds of the parameters."""
         return BOUNDS[self.robot if self.bounds is None else self.bounds]
 
     def speeds(self, num: int = NUM_SPEEDS) -> np.ndarray:
-        """Return so many speeds, evenly over the range, m/s; the paper's 11 for its robot."""
+        """Return `num` speeds, evenly over the range, m/s; by default the paper's 11 for its robot."""
         low, high = self.context_range()
         return np.linspace(low[0], high[0], num, dtype=np.float32)
 
@@ -322,7 +322,7 @@ def walk_at_all_speeds(
 ) -> tuple[np.ndarray, Any]:
     """Roll out the mean policies (trials, ...) at 11 speeds, for the NAO the paper's, with fresh seeds.
 
-    They walk in so many times the usual noise.
+    They walk in `noise` times the usual noise.
 
     Returns:
         The speeds (n,), m/s, and the outcome (trials, n, seeds).

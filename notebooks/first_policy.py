@@ -66,7 +66,7 @@ plt.show()
 # ## Learn
 #
 # An iteration draws 40 contexts, samples an answer to each, sees the 40 rewards, and moves towards the
-# better answers, but no farther than `kl_bound` allows. Here `on_iteration` keeps every state to look at.
+# better answers, within the KL bound. Here `on_iteration` keeps every state to look at.
 
 # %%
 algorithm = cj.creps(features, features, kl_bound=0.5, archive_size=400)

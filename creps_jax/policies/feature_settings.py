@@ -31,7 +31,7 @@ class Features:
     bandwidth: float | None = None
 
     def complete(self, dim: int) -> "Features":
-        """Return the settings for so many context variables, with what None stands for."""
+        """Return the settings for a number of context variables, with what None stands for."""
         if self.num_centers is not None:
             return self
         return dataclasses.replace(self, num_centers={1: 5, 2: 3}.get(dim, 2))

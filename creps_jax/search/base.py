@@ -36,7 +36,7 @@ class Search(KeepsPrograms):
         init: (policy) -> state, a `SearchState`.
         ask: (key, state, contexts (n, s)) -> thetas (n, d) to try.
         tell: (state, batch) -> (state, info): learn from a `Batch`; info is any pytree of arrays.
-        policy: (state) -> the policy of today.
+        policy: (state) -> the current policy.
     """
 
     init: Callable[[Any], Any]

@@ -71,7 +71,7 @@ def independence_p_value(
 
 
 def share_of_evidence(p_value: ScalarLike, significance: float) -> Scalar:
-    """Return the fraction of its way that the covariance may move, from 0 to 1.
+    """Return the fraction of its way that the covariance moves, from 0 to 1.
 
     Args:
         p_value: From `independence_p_value`, from 0 to 1.

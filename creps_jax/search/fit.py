@@ -1,4 +1,4 @@
-"""Fit the next policy to weighted samples: as the paper does, or within bounds on how far it may move.
+"""Fit the next policy to weighted samples: as the paper does, or with bounds on how far it moves.
 
 The bound of contextual REPS holds for the weights of the samples. The Gaussian that is fitted to them
 moves farther: with 50 samples of 20 parameters by some 10 nats where 1 was allowed, mostly because too
@@ -47,7 +47,7 @@ def weighted_ml(
 def bounded_ml(
     *, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05, entropy_loss_bound: float | None = None
 ) -> MStep:
-    """Make the fit by weighted maximum likelihood within bounds on how far mean and covariance may move.
+    """Make the fit by weighted maximum likelihood with bounds on how far mean and covariance move.
 
     The relative entropy of the new policy to the old one, averaged over the contexts, is a sum of a part of
     the mean and a part of the covariance:

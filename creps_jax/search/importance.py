@@ -1,4 +1,4 @@
-"""Importance weights of archived samples: how much each says about the policy of today."""
+"""Importance weights of archived samples: how much each says about the current policy."""
 
 import dataclasses
 from collections.abc import Callable

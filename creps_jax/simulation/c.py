@@ -145,7 +145,7 @@ class _Tools:
         self._arrays = [np.zeros((0, *shape)) for shape in self._shapes]
 
     def arrays(self, num: int) -> list[np.ndarray]:
-        """Return arrays for so many robots' first states, accelerations, controls and states."""
+        """Return arrays for a number of robots: first states, accelerations, controls and states."""
         if num > len(self._arrays[0]):
             self._arrays = [np.zeros((num, *shape)) for shape in self._shapes]
         return [array[:num] for array in self._arrays]

@@ -106,7 +106,7 @@ def payload(low: float, high: float) -> Condition:
 
 @checks.arguments
 def friction(low: float, high: float) -> Condition:
-    """Let feet slide at so many times the friction of the robot's model, whose coefficient is 1 for the NAO.
+    """Multiply the friction of the robot's model, whose coefficient is 1 for the NAO.
 
     Raises:
         ValueError: If the range is not in order, or does not stay above zero.

@@ -79,7 +79,7 @@ class WalkNoise(NamedTuple):
     start: float = 0.01
 
     def times(self, factor: float) -> "WalkNoise":
-        """Return so many times this noise."""
+        """Return this noise times a factor."""
         return WalkNoise(*(factor * size for size in self))
 
 

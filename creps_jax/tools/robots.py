@@ -17,7 +17,7 @@ class Walker(NamedTuple):
         robot: the robot.
         low: lowest speed, m/s.
         high: highest speed, m/s.
-        bounds: the box that the walking parameters are kept in.
+        bounds: lower and upper bounds of the walking parameters.
     """
 
     robot: Robot

@@ -1,4 +1,4 @@
-"""Film recorded walks with MuJoCo's renderer, several side by side, where OpenGL is to be had.
+"""Film recorded walks with MuJoCo's renderer, several side by side, where there is OpenGL.
 
 Rendering happens in a process of its own: a graphics driver that fails or crashes takes no run
 down with it, and the choice of a graphics library stays out of the parent.
@@ -98,7 +98,7 @@ def _explain(code: int, output: str) -> str:
     last = lines[-1] if lines else f"the renderer ended with code {code}"
     if "imageio_ffmpeg" in last or "No space left" in last:
         return f"no video: {last}"
-    return f"no video: OpenGL is not to be had ({last}); on Debian or Ubuntu: {_LIBRARIES_HINT}"
+    return f"no video: there is no OpenGL ({last}); on Debian or Ubuntu: {_LIBRARIES_HINT}"
 
 
 def _render_job(job: Path, video: Path, still: Path) -> None:

@@ -54,7 +54,7 @@ class Recent:
         self._kept.append(samples)
 
     def groups(self, most: int) -> list[Group]:
-        """Return at most so many groups, one for each round context within the range so far."""
+        """Return at most `most` groups, one for each round context within the range so far."""
         kept = tuple(self._kept)  # a view is drawn by a thread of its own
         if not kept or most < 1:
             return []

@@ -37,7 +37,7 @@ class New:
         exploration: Factor of the policy's standard deviations; 1 by default.
         batch_size: Trials that make an update; 10 by default.
         archive_size: Last trials that are learned from; five batches by default, or more if that is too few.
-        kl_bound: How far the weights of trials may move from even ones, in nats; 0.5 by default.
+        kl_bound: Bound on the relative entropy of the weights of trials, in nats; 0.5 by default.
         seed: Seed of contexts and exploration; 0 by default.
     """
 
@@ -58,7 +58,7 @@ class Ask:
     Attributes:
         folder: The session.
         context: A number for each context variable; by default each new trial gets its own from the range.
-        more: Ask for so many new trials, though others are pending.
+        more: Number of new trials to ask for, though others are pending.
     """
 
     folder: Positional[_Folder]
@@ -68,7 +68,7 @@ class Ask:
 
 @dataclasses.dataclass(frozen=True)
 class Tell:
-    """Tell what came of a trial.
+    """Enter the result of a trial.
 
     Attributes:
         folder: The session.
@@ -100,7 +100,7 @@ class Status:
 
 @dataclasses.dataclass(frozen=True)
 class Save:
-    """Save the policy of today as other commands read it.
+    """Save the current policy as other commands read it.
 
     Attributes:
         folder: The session.
@@ -122,7 +122,7 @@ _Action = (
 
 @dataclasses.dataclass(frozen=True)
 class SessionCommand:
-    """Learn on a real robot, trial by trial, from a folder that loses nothing."""
+    """Learn on a real robot, trial by trial, from a folder that stays consistent."""
 
     action: OmitArgPrefixes[_Action]
 

@@ -68,7 +68,7 @@ class Learner:
 
     @property
     def policy(self) -> LinearGaussian:
-        """The policy of today."""
+        """The current policy."""
         return self._state.policy
 
     def learn(self, batches: Sequence[Sequence[Trial]]) -> None:
@@ -121,7 +121,7 @@ class Learner:
         return np.asarray(self._programs.means(policy))
 
     def learned(self) -> Learned:
-        """Return the policy of today as other tools take it."""
+        """Return the current policy as other tools take it."""
         settings = self.settings
         return Learned(
             self.policy,

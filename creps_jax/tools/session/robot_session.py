@@ -1,4 +1,4 @@
-"""Search with a robot: ask for trials, run them, tell what came of them, at any time and from any process."""
+"""Search with a robot: ask for trials, run them, tell their results, at any time and from any process."""
 
 import dataclasses
 import os
@@ -46,7 +46,7 @@ class Status(NamedTuple):
         least_trials: trials that an update needs, broken ones not counted.
         contexts: (n, s) a grid over the range.
         first_parameters: (n, d) mean parameters of the first policy there.
-        parameters: (n, d) mean parameters of the policy of today.
+        parameters: (n, d) mean parameters of the current policy.
     """
 
     settings: Settings
@@ -210,7 +210,7 @@ class RobotSession:
         )
 
     def policy(self) -> "Learned":
-        """Return the policy of today; its `save` writes a policy file."""
+        """Return the current policy; its `save` writes a policy file."""
         return self._learned(self._record()).learned()
 
     def _record(self) -> Record:

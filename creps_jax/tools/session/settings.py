@@ -85,10 +85,10 @@ class Settings:
         features: of the context; the policy's mean is linear in them.
         constraint: how parameters are kept in their bounds: "sigmoid" searches numbers that are squashed into
             them, "clip" cuts off what is drawn outside, and learns from what is left.
-        kl_bound: epsilon, how far the weights of samples may move from even ones, nats.
-        mean_kl_bound: how far an update may move the policy's mean, nats, see `bounded_ml`; with
+        kl_bound: epsilon, bound on the relative entropy of the weights of samples, nats.
+        mean_kl_bound: bound on the change of the policy's mean in an update, nats, see `bounded_ml`; with
             `cov_kl_bound` None it is not bounded, as in the paper.
-        cov_kl_bound: how far it may move the covariance, nats.
+        cov_kl_bound: the same for the covariance, nats.
         batch_size: trials that make an update.
         archive_size: last trials that are learned from; five batches by default, or more if that is too few.
         seed: of the contexts and of the exploration.

@@ -1,4 +1,4 @@
-"""Trials of a session: those asked for, and what came of them."""
+"""Trials of a session: those asked for, and their results."""
 
 import dataclasses
 import math
