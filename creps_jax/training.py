@@ -285,7 +285,10 @@ def _iterate(setup: _Setup, algorithm: Search, key: PRNGKey, state: Any) -> tupl
             f"got thetas of shape {jnp.shape(thetas)}"
         )
     outcomes, is_failed = roll_out(task, devices, rollout_key, contexts, thetas)
-    state, info = algorithm.tell(state, Batch(contexts, thetas, outcomes.reward))
+    told = algorithm.tell(state, Batch(contexts, thetas, outcomes.reward))
+    if not (isinstance(told, tuple) and len(told) == 2):
+        raise ValueError(f"tell must return the new state and info, got {checks.shown(told)}")
+    state, info = told
     log = IterationLog(
         info=info,
         mean_reward=jnp.mean(outcomes.reward),

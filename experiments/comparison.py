@@ -125,6 +125,10 @@ def compare(
         "context": np.asarray(grid),
     }
     keys = trial_keys(learn_key, settings.trials)
+    for contender in contenders.values():
+        contender.algorithm.init(
+            contender.start
+        )  # Refuses settings before hours are spent on another contender.
     for name, contender in contenders.items():
         _, log = learn(keys, *contender, plan, session=session, name=name, devices=devices)
         # A resumed run may have gone on for longer than is asked of it now.

@@ -163,8 +163,15 @@ def _run(
         update("interrupted")
         say(f"stopped; to go on: python -m experiments run {name} --resume --out {folder}")
         raise
-    except Exception:
+    except Exception as error:
         update("failed")
+        has_begun = any(folder.glob("checkpoint-*.npz"))
+        if isinstance(error, ValueError) and before == 0.0 and not has_begun:
+            # Settings were refused: there is nothing to go on from, and no earlier run is to be hidden by it.
+            (folder / results.MANIFEST).unlink()
+            with contextlib.suppress(OSError):
+                (folder / folder_lock.LOCK).unlink(missing_ok=True)
+                folder.rmdir()
         raise
     update("finished")
     if results.robot_of(manifest) == _PAPERS_ROBOT:

@@ -84,16 +84,22 @@ class Learned:
             ) from None
         object.__setattr__(self, "task", task)
 
-    def __call__(self, *context: Any) -> dict[str, float]:
+    def __call__(self, *context: Any, **named: Any) -> dict[str, float]:
         """Return the parameters for a context, by name, in their units and within their bounds.
 
         Args:
-            context: A number for each context variable.
+            context: A number for each context variable, or one sequence of them.
+            named: The same by name, in place of `context`.
 
         Raises:
             ValueError: If there are more or fewer, or one is outside the range that was learned; see
                 `in_range`.
         """
+        if named:
+            names = self.contexts.names
+            if context or set(named) != set(names):
+                raise UserError(f"values must be a number for each of {', '.join(names)}, got {named}")
+            context = tuple(named[name] for name in names)
         return dict(zip(self.parameters.names, self.theta(*context).tolist(), strict=True))
 
     def theta(self, *context: Any) -> np.ndarray:
@@ -110,7 +116,7 @@ class Learned:
         Raises:
             ValueError: As calling does.
         """
-        numbers = jnp.asarray(self.contexts.checked(context), jnp.float32)
+        numbers = jnp.asarray(self.contexts.checked(_flat(context)), jnp.float32)
         return np.asarray(self.features(numbers)) @ np.asarray(self.policy.coef)
 
     def in_range(self, *context: Any) -> bool:
@@ -119,7 +125,7 @@ class Learned:
         Raises:
             ValueError: If there is not a number for each context variable.
         """
-        return self.contexts.contains(context)
+        return self.contexts.contains(_flat(context))
 
     def thetas(self, contexts: Float[Array, "n s"]) -> Float[Array, "n d"]:
         """Return the parameters for many contexts; it can be jitted, and does not look at the range."""
@@ -189,7 +195,7 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
         return Learned(
             LinearGaussian(jnp.asarray(arrays["coef"]), jnp.asarray(arrays["cov_chol"])),
             _features(json.loads(str(arrays["features"])), (context_low, context_high), features),
-            _space(arrays, "context", context_low, context_high, "none"),
+            _space(arrays, "context", context_low, context_high, "clip"),
             _space(arrays, "param", param_low, param_high, constraint),
             json.loads(str(arrays["task"])),
         )
@@ -197,6 +203,12 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
         raise UserError(f"{file} is an incomplete policy file: it has no {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{file}: {error}") from error
+
+
+def _flat(context: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return the numbers of a context that was given as one sequence."""
+    is_sequence = len(context) == 1 and np.ndim(context[0]) == 1 and not isinstance(context[0], str)
+    return tuple(context[0]) if is_sequence else context
 
 
 def _space(

@@ -33,7 +33,9 @@ class Space:
         low: Lower ends; minus infinity where there is none.
         high: Upper ends.
         units: Units, by default none.
-        constraint: Of parameters, how free numbers are kept inside: one of `CONSTRAINTS`.
+        constraint: Of parameters, how the numbers that a search draws are kept inside: "sigmoid" squashes
+            them, as `sigmoid_constrained` does in learning, "clip" cuts them off at the bounds, "none" leaves
+            them.
 
     Raises:
         ValueError: If names are missing or equal, there is not one end and unit for each, an end is no
@@ -44,7 +46,7 @@ class Space:
     low: tuple[float | int, ...]
     high: tuple[float | int, ...]
     units: tuple[str, ...] = ()
-    constraint: str = "none"
+    constraint: str = "clip"
 
     def __post_init__(self) -> None:
         """Check the fields, and turn sequences into tuples."""

@@ -238,10 +238,19 @@ class CrepsSettings(KeepsPrograms):
             ValueError: If shapes do not fit the features or the policy.
 
         Warns:
-            UserWarning: If much of the difference of the rewards is lost in their rounding.
+            UserWarning: If much of the difference of the rewards is lost in their rounding, or a batch has
+                more samples than the archive.
         """
         state = self._checked_state(state)
-        archive = self.programs.push(state.archive, *_checked_batch(batch, state.archive))
+        checked = _checked_batch(batch, state.archive)
+        num, size = len(checked[0].reward), len(state.archive.batch.reward)
+        if num > size:
+            warnings.warn(
+                f"archive_size should be at least {num}, the samples of a batch, got {size}: "
+                "only the last of them are learned from",
+                stacklevel=2,
+            )
+        archive = self.programs.push(state.archive, *checked)
         state = state._replace(archive=archive)
         return self.programs.update(self.kl_bound, state)
 

@@ -24,7 +24,8 @@ Use a learned policy.
   creps-jax export --to walk.h      write a policy (.onnx, .h) or one of its walks (.csv, .npz)
   creps-jax session                 learn on a real robot, trial by trial
 
-Without --policy this is the policy that was learned last, or else the one that comes with the package.
+Without --policy, play and export take the policy that was learned last, or else the one that comes with the
+package; play prints where it is. A session needs --policy or --define.
 Add --help to any of these for all its options.
 """
 

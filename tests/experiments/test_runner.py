@@ -69,6 +69,23 @@ def test_a_run_that_stopped_goes_on_with_the_same_numbers(tiny, monkeypatch, err
     assert results.load_manifest(Path("part"))["status"] == "finished"
 
 
+def test_settings_that_are_refused_leave_no_run_behind(tiny, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        interrupt_after(patch, 2, KeyboardInterrupt())
+        run()
+    unfinished = runner.folder_to_resume("tiny", None)
+
+    def refuse(settings, key, session):
+        raise ValueError("kl_bound must be above 0")
+
+    monkeypatch.setattr(tiny, "run", refuse)
+    for out in (None, Path("named")):
+        with pytest.raises(ValueError, match="kl_bound"):
+            run(out=out)
+    assert runner.folder_to_resume("tiny", None) == unfinished
+    assert not Path("named").exists()
+
+
 def test_a_run_that_is_running_is_not_joined(tiny):
     folder = run(out=Path("here"))
     with folder_lock.locked(folder, wait=0.0), pytest.raises(UserError, match="here is in use by another"):

@@ -94,6 +94,26 @@ def test_parameters_are_the_squashed_mean_by_name(context):
     np.testing.assert_allclose(list(named.values()), expected, rtol=1e-5)
 
 
+def test_a_context_is_given_by_numbers_a_sequence_or_names():
+    contexts = Space(("x", "y"), (0.0, 0.0), (1.0, 1.0))
+    policy = make_policy(linear_features(2), contexts)
+    expected = policy(0.2, 0.7)
+    for given in ([0.2, 0.7], (0.2, 0.7), np.array([0.2, 0.7])):
+        assert policy(given) == expected and policy.in_range(given)
+    assert policy(y=0.7, x=0.2) == expected
+    for arguments, named in (((0.2,), {"y": 0.7}), ((), {"x": 0.2}), ((), {"x": 0.2, "y": 0.7, "z": 1.0})):
+        with pytest.raises(ValueError, match="values must be a number for each of x, y, got"):
+            policy(*arguments, **named)
+
+
+def test_bounds_are_held_unless_asked_otherwise():
+    far = LinearGaussian(jnp.full((2, 1), 5.0), jnp.eye(1))
+    bounded = Learned(far, linear_features(1), SPEED, Space(("b",), (-1.0,), (1.0,)))
+    assert bounded(0.5) == {"b": 1.0}
+    free = dataclasses.replace(bounded, parameters=dataclasses.replace(bounded.parameters, constraint="none"))
+    assert free(0.5) == {"b": 7.5}
+
+
 def test_parameters_of_other_constraints():
     policy = LinearGaussian(jnp.array([[1.0, -3.0], [10.0, 0.0]]), jnp.eye(2))
     free = Learned(policy, linear_features(1), SPEED, dataclasses.replace(WALK, constraint="none"))

@@ -277,7 +277,7 @@ def test_a_robot_gets_its_own_policy_and_set_points(folder, capsys):
     left, right = (set_point[:, JOINT_NAMES.index(f"{side}_hip_yaw_pitch")] for side in ("left", "right"))
     np.testing.assert_allclose(left, right, atol=1e-6)
     assert main(["export", "--robot", "nao_h25", "--to", "h25.h"]) == 0
-    assert (folder / "h25.h").read_text() == make_header(load(shipped))
+    assert (folder / "h25.h").read_text() == make_header(load(shipped), "h25")
 
 
 def test_mistakes_are_one_clear_line(folder, capsys):

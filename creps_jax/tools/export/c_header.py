@@ -19,20 +19,21 @@ _PLAIN = string.ascii_letters + string.digits + " _.,:;/^*+-=%()[]"
 
 
 def save(path: Path, policy: Learned) -> None:
-    """Write a policy as a C header, atomically."""
-    save_text(path, make_header(policy))
+    """Write a policy as a C header, atomically; what it declares begins with the name of the file."""
+    save_text(path, make_header(policy, path.stem))
 
 
-def make_header(policy: Learned) -> str:
+def make_header(policy: Learned, name: str | None = None) -> str:
     """Return a header of C99, and C++, with names, units, bounds, range and function of a policy.
 
-    What it declares begins with the name of the task; characters that C has not become underscores.
+    What it declares begins with the name, by default that of the task; characters that C has not become
+    underscores.
 
     Raises:
         UserError: if a number of the policy is too large for single precision.
     """
     formula = formula_of(policy)
-    prefix = _prefix(policy)
+    prefix = _prefix(str(policy.task.get("name", "")) if name is None else name)
     names = {"prefix": prefix, "PREFIX": prefix.upper()}
     features = RBF if len(formula.centers) else LINEAR
     is_bounded = policy.parameters.constraint != "none"
@@ -77,9 +78,9 @@ def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
     return "\n".join(tables)
 
 
-def _prefix(policy: Learned) -> str:
-    """Return the task's name as the beginning of C identifiers."""
-    name = _identifier(str(policy.task.get("name", ""))).lower()
+def _prefix(name: str) -> str:
+    """Return a name as the beginning of C identifiers."""
+    name = _identifier(name).lower()
     return f"task_{name}" if name[:1].isdigit() else name or "learned"
 
 

@@ -60,7 +60,8 @@ def formula_of(learned: Learned) -> Formula:
     with np.errstate(over="ignore"):
         single = Formula(*(np.asarray(values, np.float32) for values in numbers))
     for name, values in single._asdict().items():
-        is_bound = name.startswith("param") and learned.parameters.constraint == "none"
-        if not (np.isfinite(values).all() or is_bound):
+        # Parameters without bounds have infinite ones.
+        is_held = np.isfinite(values) | (np.isinf(getattr(numbers, name)) & name.startswith("param"))
+        if not is_held.all():
             raise UserError(f"{name} of the policy is too large for single precision")
     return single

@@ -151,6 +151,11 @@ def _new(command: New, say: Callable[[str], None]) -> None:
     say(f"contexts: {_list(settings.contexts)}")
     say(f"parameters: {_list(settings.parameters)}")
     say(f"an update takes {settings.batch_size} trials; the last {settings.archive_size} are learned from")
+    from creps_jax.tools.session.start import feature_map
+
+    least = feature_map(settings).size + len(settings.parameters)
+    if least > settings.batch_size:
+        say(f"the first update needs {least} valid trials: more than one batch")
     say(f"next: creps-jax session ask {command.folder}")
 
 
@@ -200,12 +205,15 @@ def _tell(command: Tell, say: Callable[[str], None]) -> None:
         say(
             f"the batch is complete: the policy moved by {update.kl:.3f} nats (KL), its entropy is now "
             f"{update.entropy:.2f}; {update.effective_samples:.1f} of {update.num_valid} trials effective; "
-            f"p = {update.p_value:.2g} that rewards depend on parameters by chance"
+            f"p = {update.p_value:.2g}: the smaller, the clearer do rewards depend on the parameters"
         )
     elif not update.is_informative and update.num_valid >= sum(update.policy.coef.shape):
         say("the batch is complete, but its rewards tell nothing that the context does not: the policy stays")
     else:
-        say(f"the batch is complete, but {update.num_valid} valid trials are too few: the policy stays")
+        say(
+            f"the batch is complete, but {update.num_valid} valid trials are too few for a first update: it "
+            f"needs {sum(update.policy.coef.shape)}. They are kept, and the policy stays"
+        )
 
 
 def _status(command: Status, say: Callable[[str], None]) -> None:

@@ -55,8 +55,8 @@ class Parameter(Context):
         super().__post_init__()
         if self.start is not None and not self.low <= self.start <= self.high:
             raise UserError(
-                f"start of {self.name} must be within its bounds, {self.low:g} to {self.high:g} {self.unit}, "
-                f"got {self.start:g}"
+                f"start of {self.name} must be within its bounds, "
+                f"{f'{self.low:g} to {self.high:g} {self.unit}'.rstrip()}, got {self.start:g}"
             )
         if self.spread is not None and not self.spread > 0:
             raise UserError(f"spread of {self.name} must be above zero, got {self.spread:g}")

@@ -142,7 +142,7 @@ def feature_map(settings: Settings) -> FeatureMap:
         raise UserError(str(error)) from error
 
 
-def space_of(variables: Sequence[Context], constraint: str = "none") -> Space:
+def space_of(variables: Sequence[Context], constraint: str = "clip") -> Space:
     """Return the variables of a session as a policy describes them."""
     low, high = ends(variables)
     return Space(
