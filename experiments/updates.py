@@ -58,11 +58,13 @@ class Settings:
         iterations: iterations of learning.
         trials: trials of each contender.
         samples: new samples of an iteration.
+        first_samples: new samples of the first iteration; None is `samples`.
     """
 
     iterations: int = 200
     trials: int = 20
     samples: int = 50
+    first_samples: int | None = None
 
 
 SETTINGS = {"best": Settings(), "quick": Settings(trials=4)}
@@ -78,7 +80,7 @@ class Bench(NamedTuple):
 def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
     """Learn each task with each fit, from the same first policy and the same keys."""
     setup_key, learn_key = jax.random.split(key)
-    plan = LearnerSettings(settings.iterations, settings.trials, settings.samples)
+    plan = LearnerSettings(settings.iterations, settings.trials, settings.samples, settings.first_samples)
     arrays = {}
     for name, make in BENCHES.items():
         bench = make(setup_key, plan)
