@@ -33,6 +33,12 @@ PAGES = [
 
 
 @pytest.mark.parametrize("page", PAGES)
+def test_no_number_was_left_to_be_filled_in(page):
+    text = re.sub(r"`[^`]*`|```.*?```", "", (ROOT / page).read_text(), flags=re.DOTALL)
+    assert not re.findall(r"\b[A-Z]{3,}_[A-Z]+\b|\bTODO\b|\bTBD\b|\bFIG[0-9]+\b|\bFITS\b", text)
+
+
+@pytest.mark.parametrize("page", PAGES)
 def test_files_that_a_page_names_are_there(page):
     text = (ROOT / page).read_text()
     folders = (ROOT, ROOT / "creps_jax")
