@@ -104,9 +104,9 @@ class Space:
         except (TypeError, ValueError):
             numbers = np.zeros(0)
         if len(numbers) != self.size:
-            given = (
-                ", ".join(map(checks.shown, values)) if isinstance(values, tuple) else checks.shown(values)
-            )
+            each = list(values) if isinstance(values, tuple) else [values]
+            is_plain = not any(hasattr(value, "shape") for value in each)
+            given = checks.shown(each) if is_plain else ", ".join(map(checks.shown, each))
             raise UserError(f"values must be a number for each of {', '.join(self.names)}, got {given}")
         return numbers
 

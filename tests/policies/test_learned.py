@@ -145,7 +145,7 @@ def test_several_context_variables_each_have_a_range():
     np.testing.assert_allclose(policy.theta(0.5, -3.0), [1.7, -3.0], rtol=1e-6)
     with pytest.raises(ValueError, match=r"slope must be within its range, -5 to 5 deg, got 6"):
         policy.theta(0.5, 6.0)
-    with pytest.raises(ValueError, match=r"a number for each of speed, slope, got 0\.5"):
+    with pytest.raises(ValueError, match=r"a number for each of speed, slope, got \[0\.5\]"):
         policy.theta(0.5)
 
 

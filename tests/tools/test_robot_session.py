@@ -424,7 +424,7 @@ def broken(*path, **values) -> dict:
         (broken("parameters", 0, start=7.0), "start of speed must be within its bounds, 1 to 6 m/s, got 7"),
         (broken("parameters", 0, start=6.0), "start of speed is at its bound, 6"),
         (broken("parameters", 0, spread=0.0), "spread of speed must be above zero, got 0"),
-        (broken("parameters", 0, spread=1e-60), "diagonal of its cov_chol above zero"),
+        (broken("parameters", 0, spread=1e-60), "in single precision: std must be above zero"),
         (broken("features", kind="cubic"), "features must be one of linear, rbf, got 'cubic'"),
         (broken("features", num_centers=0), "num_centers must be at least 1, got 0"),
         (broken("features", num_centers=2.5), r"features\.num_centers must be a whole number, got 2\.5"),

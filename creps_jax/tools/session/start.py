@@ -126,7 +126,10 @@ def _start(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
         # The slope of the sigmoid makes the spread, to first order, that of the parameters.
         share = (start - low) / (high - low)
         start, spread = np.log(share / (1 - share)), spread / ((high - low) * share * (1 - share))
-    policy = start_policy(feature_map(settings), len(settings.parameters), mean=start, std=spread)
+    try:
+        policy = start_policy(feature_map(settings), len(settings.parameters), mean=start, std=spread)
+    except ValueError as error:
+        raise UserError(f"start and spread must make a Gaussian in single precision: {error}") from error
     return np.asarray(policy.coef), np.asarray(policy.cov_chol)
 
 
