@@ -16,7 +16,6 @@ from creps_jax import files
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.errors import UserError
 from creps_jax.policies.feature_settings import Features
-from creps_jax.policies.features import quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.policies.learned import Learned
 from creps_jax.policies.space import Space, sigmoid_gate
@@ -364,7 +363,7 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
 def make_algorithm(settings: Settings) -> Creps:
     """Set up contextual REPS; the RBFs serve as policy and as baseline features."""
     features = settings.features.make(*settings.context_range())
-    baseline = quadratic_features(features.context_dim) if settings.features.kind == "linear" else features
+    baseline = settings.features.make_baseline(*settings.context_range())
     return creps(
         features,
         baseline,

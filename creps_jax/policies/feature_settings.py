@@ -51,3 +51,14 @@ class Features:
             num_centers = self.complete(np.size(low)).num_centers
             return rbf_features(low, high, num_centers or 0, bandwidth=self.bandwidth)
         raise ValueError(f"features must be one of {', '.join(FEATURE_KINDS)}, got {self.kind!r}")
+
+    def make_baseline(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
+        """Return the baseline features that go with these: quadratic ones for linear policies, else the same.
+
+        Raises:
+            ValueError: As `make` does.
+        """
+        from creps_jax.policies.features import quadratic_features
+
+        features = self.make(low, high)
+        return quadratic_features(features.context_dim) if self.kind == "linear" else features

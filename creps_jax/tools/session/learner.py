@@ -15,7 +15,6 @@ import numpy as np
 from creps_jax.contexts import context_grid
 from creps_jax.errors import UserError
 from creps_jax.policies import gaussian
-from creps_jax.policies.features import quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned
 from creps_jax.search.archive import Batch
@@ -156,8 +155,8 @@ class _Programs(NamedTuple):
 def _programs(settings: Settings) -> _Programs:
     features = feature_map(settings)
     num_contexts = len(settings.contexts)
-    baseline = quadratic_features(num_contexts) if settings.features.kind == "linear" else features
     low, high = ends(settings.contexts)
+    baseline = settings.features.make_baseline(low, high)
     try:
         algorithm = creps(
             features,
