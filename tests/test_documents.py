@@ -1,9 +1,12 @@
-"""What the documents say runs: the README's example, and the notebooks from top to bottom."""
+"""Run the code and the commands of README.md and docs/, and the notebooks from top to bottom."""
 
 import doctest
 import importlib.util
 import os
 import re
+import runpy
+import shlex
+import shutil
 from pathlib import Path
 
 import jupytext
@@ -11,17 +14,14 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from creps_jax.files import policies_folder
+from creps_jax.tools import cli
+from experiments import registry
+
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 # `.ci/run` builds the pages of docs/, which executes the others; they take too long to be run here each time.
 QUICK = ("first_policy", "first_walk")
-
-
-def test_readme_example_runs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    failed, tried = doctest.testfile(str(ROOT / "README.md"), module_relative=False)
-    assert failed == 0
-    assert tried >= 10
 
 
 PAGES = [
@@ -30,6 +30,69 @@ PAGES = [
     "experiments/DEVIATIONS.md",
     *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
 ]
+
+
+def blocks(page: str, language: str) -> list[str]:
+    """Return the fenced blocks of a page in a language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
+
+
+WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]
+NOT_INSTALLED = ("tensorboardX", "wandb")
+"""Packages that pages use and the tests do not need: without them, their blocks are skipped."""
+
+
+def test_pages_have_python():
+    assert {"README.md", "docs/choosing.md", "docs/export.md", "docs/logging.md", "docs/tasks.md"} <= set(
+        WITH_PYTHON
+    )
+    assert "\n>>> " in (ROOT / "README.md").read_text()
+
+
+@pytest.mark.parametrize("page", WITH_PYTHON)
+def test_python_of_a_page_runs(page, tmp_path, monkeypatch):
+    """Run the blocks of a page one after the other; a block of `>>>` lines prints what it says."""
+    monkeypatch.chdir(tmp_path)
+    names, missing = {"__name__": "page"}, []
+    for test in re.findall(r"literalinclude\} \.\./(tests/\S+\.py)", (ROOT / page).read_text()):
+        names |= runpy.run_path(str(ROOT / test))  # The page shows code of this test, and uses it.
+    for number, block in enumerate(blocks(page, "python"), start=1):
+        if block.startswith(">>>"):
+            example = doctest.DocTestParser().get_doctest(block, {}, f"{page}, block {number}", page, 0)
+            example.globs = names
+            assert doctest.DocTestRunner().run(example, clear_globs=False).failed == 0
+            continue
+        try:
+            exec(compile(block, f"{page}, block {number}", "exec"), names)
+        except ModuleNotFoundError as error:
+            if error.name not in NOT_INSTALLED:
+                raise
+            missing.append(f"block {number} needs {error.name}")
+    if missing:
+        pytest.skip(f"all other blocks ran; {', '.join(missing)}")
+
+
+@pytest.mark.parametrize("page", ["docs/export.md", "docs/session.md"])
+def test_commands_of_a_page_run(page, tmp_path, monkeypatch):
+    """Run the commands `creps-jax` of a page one after the other, with the JSON and the policy they read."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(policies_folder() / "walk.npz", "policy.npz")
+    for block in blocks(page, "json"):
+        Path("arm.json").write_text(block)
+    commands = re.findall(r"^creps-jax .*$", "".join(blocks(page, "sh")), re.MULTILINE)
+    assert commands
+    for command in commands:
+        assert cli.main(shlex.split(command, comments=True)[1:]) == 0, command
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_experiments_that_a_page_names_are_there(page):
+    text = (ROOT / page).read_text()
+    modules = re.findall(r"python -m ((?:experiments|creps_jax)[\w.]*)", text)
+    assert not [module for module in modules if importlib.util.find_spec(module) is None]
+    for name, preset in re.findall(r"(?:experiments|\.\.\.|`) ?run ([a-z]\w+)(?: --preset (\w+))?", text):
+        if name != registry.ALL:
+            assert not preset or registry.preset_settings(registry.load(name), preset)
 
 
 @pytest.mark.parametrize("page", PAGES)
