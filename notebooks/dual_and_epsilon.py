@@ -14,11 +14,12 @@
 # ---
 
 # %% [markdown]
-# # The dual, and what epsilon does
+# # The dual function and epsilon
 #
-# How far may one update follow the rewards? Relative entropy policy search answers with one number:
-# `epsilon` nats (`kl_bound`) between the samples as they came and as they are weighed. The rest is the
-# minimum of a convex function of a temperature and a baseline, the dual.
+# Relative entropy policy search (REPS) gives each sample a weight: a high reward gives a large weight.
+# The bound `epsilon` (`kl_bound`, in nats) limits the KL divergence between these weights and equal
+# weights. The weights follow from the minimum of a convex function, the dual. Its variables are a
+# temperature and a baseline.
 
 # %%
 import sys
@@ -29,7 +30,7 @@ sys.path.insert(0, str(ROOT))
 
 from creps_jax.tools.process import prepare
 
-prepare()  # It keeps what jax compiles: the next run is quicker.
+prepare()  # Keep compiled programs in a cache, so that the next run starts faster.
 
 import jax
 import jax.numpy as jnp
@@ -43,11 +44,13 @@ from creps_jax.search.fit import WeightedSamples, weighted_ml
 from creps_jax.tools import plots
 
 # %% [markdown]
-# ## One batch, three epsilons
+# ## One batch, three values of epsilon
 #
-# 150 answers `theta` to random contexts `s`, rewarded by `-(theta - sin s)^2`. `solve_dual` finds the
-# temperature `eta` and the baseline `V(s)`; a sample gets the weight `exp((reward - V(s)) / eta)`. A small
-# epsilon listens to everybody, a large one to a few.
+# The batch has 150 random contexts `s` with random parameters `theta`. The reward is `-(theta - sin
+# s)^2`. `solve_dual` finds the temperature `eta` and the baseline `V(s)`. The weight of a sample is
+# proportional to `exp((reward - V(s)) / eta)`. With a small epsilon all samples have similar weights.
+# With a large epsilon a few samples have most of the weight. The size of a dot shows the weight. The
+# title gives the effective number of samples.
 
 # %%
 rng = np.random.default_rng(0)
@@ -71,16 +74,17 @@ for panel, epsilon, eta, d in zip(axes, epsilons, duals.temperature, weights, st
     panel.plot(line, np.sin(line), "k--", linewidth=1.2)
     panel.scatter(s, theta, s=3, color=plots.PAPER_COLOUR)
     panel.scatter(s, theta, s=3000 * d, alpha=0.5, linewidth=0)
-    title = f"ε = {epsilon:g}, η = {eta:.2g}: like {1 / np.sum(d**2):.0f} samples"
+    title = f"ε = {epsilon:g}, η = {eta:.2g}: {1 / np.sum(d**2):.0f} effective samples"
     panel.set(xlabel="context s (rad)", title=title)
 axes[0].set_ylabel("theta")
 plt.show()
 
 # %% [markdown]
-# ## The dual keeps the bound
+# ## At the minimum of the dual, the KL divergence equals the bound
 #
-# Along the temperature the dual is a valley, and its slope is `epsilon` less the KL of the weights. So at
-# the bottom the KL is the bound, whatever unit the rewards have.
+# The derivative of the dual with respect to the temperature is `epsilon` minus the KL divergence of the
+# weights. At the minimum this derivative is zero, so the KL divergence equals `epsilon`. This holds for
+# any unit of the rewards.
 
 # %%
 temperatures = np.geomspace(0.01, 10, 200).astype(np.float32)
@@ -107,17 +111,18 @@ for epsilon, eta, value, kl in zip(epsilons, duals.temperature, values, kls, str
     right.axhline(epsilon, color=curve.get_color(), linestyle=":", linewidth=1.2)
     right.plot(eta, epsilon, "o", color=curve.get_color())
 left.set(xscale="log", ylim=(-0.05, 1), xlabel="temperature η", ylabel="dual, above its minimum")
-left.set_title("The dual, and the minimum found")
+left.set_title("The dual, and its minimum (dots)")
 left.legend()
 right.set(xscale="log", yscale="log", xlabel="temperature η", ylabel="KL of the weights (nats)")
-right.set_title("There, the KL is ε")
+right.set_title("At the minimum, the KL is ε")
 plt.show()
 
 # %% [markdown]
-# ## Too small, too large, and a promise
+# ## A whole search
 #
-# A whole search repeats: draw, solve the dual, weigh, fit. Here it is written out, for ten parameters that
-# are to follow a context, with 100 samples an iteration.
+# A search repeats four steps: draw samples, solve the dual, compute the weights, fit the policy. Here the
+# four steps are written out. The task has ten parameters; the best value of each is linear in the
+# context. An iteration has 100 samples.
 
 # %%
 linear = cj.linear_features(1)
@@ -150,10 +155,12 @@ found = searches(epsilons, trials, weighted_ml)
 bounded = searches(epsilons[1:2], trials, cj.bounded_ml(mean_kl_bound=0.4, cov_kl_bound=0.1))
 
 # %% [markdown]
-# A small epsilon is slow. A large one runs after the luckiest few, and is soon sure of something wrong. But
-# 0.5 stops short as well, and the right picture tells why: epsilon bounds the weights, and the Gaussian
-# fitted to them moves farther (thin lines: the bounds), as 100 samples say too much about its spread.
-# `bounded_ml` bounds what mean and covariance really do, and the search goes on.
+# With a small epsilon the search is slow. With a large epsilon it follows a few samples with lucky
+# rewards, and its covariance shrinks too early. With 0.5 it stops too early as well. The right figure
+# shows why: epsilon bounds the weights, but the Gaussian that is fitted to the weighted samples moves
+# farther than the bound (thin lines), because 100 samples determine the covariance only roughly.
+# `bounded_ml` bounds the change of the mean and of the covariance themselves. With it the search
+# continues to improve.
 
 # %%
 rewards, moves = (np.concatenate(pair) for pair in zip(found, bounded, strict=True))
@@ -166,5 +173,5 @@ for name, reward, moved, bound in zip(names, rewards, moves, [*epsilons, 0.5], s
 plots.reward_scale(left, rewards)
 left.set(xlabel="episodes", ylabel="mean reward", title="Learning curves of ten trials")
 left.legend(fontsize=8)
-right.set(xlabel="episodes", ylabel="KL(new || old policy) (nats)", title="How far the policy really moves")
+right.set(xlabel="episodes", ylabel="KL(new || old policy) (nats)", title="KL divergence of each update")
 plt.show()

@@ -16,8 +16,9 @@
 # %% [markdown]
 # # Your first policy, in five minutes
 #
-# An optimiser finds one answer. A contextual policy is a rule: for every question `s`, here a number, an
-# answer `theta`. It is a Gaussian about its best guess, and that is how it explores.
+# An optimiser finds one parameter vector. A contextual policy is a function: it gives parameters `theta`
+# for every context `s`. Here both are one number. The policy is a Gaussian distribution of `theta` for
+# each context. It explores by drawing samples from this distribution.
 
 # %%
 import sys
@@ -28,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 
 from creps_jax.tools.process import prepare
 
-prepare()  # It keeps what jax compiles: the next run is quicker.
+prepare()  # Keep compiled programs in a cache, so that the next run starts faster.
 
 from dataclasses import replace
 
@@ -41,11 +42,11 @@ import creps_jax as cj
 from creps_jax.tools.plots import COLOURS
 
 # %% [markdown]
-# ## The task, and the building blocks
+# ## The task and the features
 #
-# The right answer is `sin s`, but nobody tells the learner. It tries a `theta` and gets a reward, `-(theta
-# - sin s)^2`. The policy's mean is a weighted sum of features, bumps along `s` (radial basis functions),
-# and what it learns is the weight of each.
+# The best parameter is `sin s`. The search does not know this function. It tries a `theta` and gets the
+# reward `-(theta - sin s)^2`. The mean of the policy is a weighted sum of features. Here the features are
+# radial basis functions (RBFs) of `s`. The search learns their weights.
 
 # %%
 low, high = 0.0, 5 * np.pi
@@ -57,16 +58,17 @@ s, theta = np.asarray(grid[:, 0]), np.linspace(-2.5, 2.5, 101)
 figure, (left, right) = plt.subplots(1, 2, figsize=(10, 3))
 image = left.pcolormesh(s, theta, -((theta[:, None] - np.sin(s)) ** 2), cmap="cividis", vmin=-4)
 figure.colorbar(image, label="reward", extend="min")
-left.set(xlabel="context s (rad)", ylabel="theta", title="The reward, which is hidden")
+left.set(xlabel="context s (rad)", ylabel="theta", title="The reward (unknown to the search)")
 right.plot(s, jax.vmap(features.apply)(grid), color=COLOURS[0], linewidth=1.2)
-right.set(xlabel="context s (rad)", ylabel="feature", title="Eleven features, which sum to one")
+right.set(xlabel="context s (rad)", ylabel="feature", title="Eleven RBF features; their sum is one")
 plt.show()
 
 # %% [markdown]
 # ## Learn
 #
-# An iteration draws 40 contexts, samples an answer to each, sees the 40 rewards, and moves towards the
-# better answers, within the KL bound. Here `on_iteration` keeps every state to look at.
+# Each iteration draws 40 contexts and samples a `theta` for each context. From the 40 rewards it updates
+# the policy towards the samples with high reward. The KL bound limits the size of the update.
+# `on_iteration` stores the state after each iteration, for the figure below.
 
 # %%
 algorithm = cj.creps(features, features, kl_bound=0.5, archive_size=400)
@@ -85,20 +87,20 @@ for panel, iteration in zip(axes, (1, 5, 15, 60), strict=True):
     panel.plot(s, np.sin(s), "k--", linewidth=1.2, label="sin s")
     tried = np.asarray(archive.age[: archive.size]) == 0
     context, theta = (np.asarray(x)[: archive.size][tried, 0] for x in archive.batch[:2])
-    panel.plot(context, theta, ".", color=COLOURS[1], label="tried")
+    panel.plot(context, theta, ".", color=COLOURS[1], label="samples")
     panel.set(xlabel="context s (rad)", title=f"Iteration {iteration}: std {std:.2g}")
 axes[0].set(ylabel="theta", ylim=(-2.7, 2.7))
 axes[-1].legend(loc="lower center", ncols=3, fontsize=8)
 plt.show()
 
 # %% [markdown]
-# It explores less and less as it finds out more. Nobody set that schedule: the spread is fitted to the good
-# samples, as the mean is.
+# The exploration decreases during learning. It follows no fixed schedule: each update fits the covariance
+# to the weighted samples, like the mean.
 #
-# ## What a policy cannot say, it cannot learn
+# ## The features limit what can be learned
 #
-# Now the same search with the features `[1, s]`: a straight line. Its reward stalls, and it keeps
-# exploring, as wide as the error that no line removes.
+# The same search with the features `[1, s]` learns a straight line. Its reward stops improving. Its
+# standard deviation stays as large as the error that remains for every line.
 
 # %%
 line = cj.linear_features(1)

@@ -16,9 +16,9 @@
 # %% [markdown]
 # # First walk
 #
-# A simulated NAO that walks at the speed you ask for. The rule that it follows was learned: from the speed
-# to the ten numbers of a walking engine (notebook `walking_engine`), by the search that learned a sine in
-# seconds (`first_policy`).
+# A simulated NAO walks at the speed that you ask for. A learned policy gives the ten parameters of a
+# walking engine for each speed. The notebook `walking_engine` shows the engine. The notebook
+# `first_policy` shows the search that learned the policy.
 
 # %%
 import os
@@ -30,7 +30,7 @@ sys.path.insert(0, str(ROOT))
 
 from creps_jax.tools.process import import_mjx_quietly, prepare
 
-prepare()  # It keeps what jax compiles: the next run is quicker.
+prepare()  # Keep compiled programs in a cache, so that the next run starts faster.
 import_mjx_quietly()
 
 # %matplotlib inline
@@ -44,9 +44,10 @@ from creps_jax.tools.plots import PAPER_COLOUR, parameters_against_context
 # %% [markdown]
 # ## The policy
 #
-# `python -m experiments run walk --preset best` learned it, from nothing but the speed reached and the
-# falls. On two cores that takes a quarter of an hour, so here we load it. Up to 0.3 m/s it takes longer
-# steps to go faster, then quicker ones. The dotted lines are bounds.
+# `python -m experiments run walk --preset best` learns such a policy in a quarter of an hour on two
+# cores. Its reward contains only the velocity of the robot and whether it fell. This notebook loads the
+# shipped policy. Up to 0.3 m/s, a faster walk has longer steps. Above 0.3 m/s it has quicker steps. The
+# dotted lines are the bounds.
 
 # %%
 policy = cj.load(ROOT / "models" / "nao" / "policies" / "walk.npz")
@@ -59,13 +60,13 @@ parameters_against_context(
     low=policy.parameters.low,
     high=policy.parameters.high,
     context_label="speed (m/s)",
-    title="Ten parameters, one rule",
+    title="Ten parameters as functions of the speed",
 )
 
 # %% [markdown]
 # ## Watch it walk
 #
-# Choose a speed. The physics are compiled at first, which takes half a minute.
+# Choose a speed. The first run compiles the physics, which takes half a minute.
 
 # %%
 speed = 0.4
@@ -76,7 +77,7 @@ time = clip.period * np.arange(1, len(clip.qpos) + 1)
 forward, left = clip.qpos[:, :2].T
 figure, axes = plt.subplots(1, 2, figsize=(11, 3.2))
 axes[0].plot(time, forward, label="walked")
-axes[0].plot(time, speed * time, "--", color=PAPER_COLOUR, label="asked for")
+axes[0].plot(time, speed * time, "--", color=PAPER_COLOUR, label="asked")
 axes[0].set(xlabel="time (s)", ylabel="forward (m)", title=clip.caption.capitalize())
 axes[0].legend()
 axes[1].plot(forward, left)
@@ -84,7 +85,7 @@ axes[1].set(xlabel="forward (m)", ylabel="left (m)", title="Path of the torso, f
 plt.show()
 
 # %% [markdown]
-# The video needs OpenGL; where it is missing, the message says what to install.
+# The video needs OpenGL. If it is missing, a message says what to install.
 
 # %%
 from IPython.display import Markdown, Video, display
@@ -99,5 +100,5 @@ except VideoError as error:
     display(Markdown(str(error)))
 
 # %% [markdown]
-# Now learn one yourself: `python -m experiments run walk --preset quick`, in five to seven minutes. And for
-# a robot that is not this one, see `your_own_robot`.
+# Next, learn a walk yourself: `python -m experiments run walk --preset quick` takes a few minutes. The
+# notebook `your_own_robot` shows how to learn with another robot.

@@ -16,9 +16,10 @@
 # %% [markdown]
 # # Reaching into a hole
 #
-# An arm of three links stands upright. It is to end with its tip at the bottom of a hole, without touching
-# the ground, and the hole is somewhere else each time. The context is where the hole is; the answer is 18
-# numbers that shape the movement of the joints (dynamic movement primitives).
+# An arm with three links stands upright. Its tip must reach the bottom of a hole, and the arm must not
+# touch the ground. The hole is at a different place in each trial. The context is the place of the hole.
+# The policy gives 18 parameters, which set the shape of the joint movements (dynamic movement primitives,
+# DMPs).
 
 # %%
 import sys
@@ -29,7 +30,7 @@ sys.path.insert(0, str(ROOT))
 
 from creps_jax.tools.process import prepare
 
-prepare()  # It keeps what jax compiles: the next run is quicker.
+prepare()  # Keep compiled programs in a cache, so that the next run starts faster.
 
 import jax
 import jax.numpy as jnp
@@ -41,10 +42,11 @@ from creps_jax.tasks.planar_arm import arm_points, hole_movement
 from creps_jax.tools import plots
 
 # %% [markdown]
-# ## Learn, with RBFs and with a line
+# ## Learn with RBFs and with linear features
 #
-# 18 parameters are many for 50 samples an iteration: `bounded_ml` keeps updates small, above all in the
-# covariance. All five trials learn at once; each tenth iteration keeps their means.
+# 18 parameters are many for iterations of 50 samples. `bounded_ml` therefore keeps the updates small,
+# especially of the covariance. Five trials learn at the same time. The means of their policies are stored
+# every tenth iteration.
 
 # %%
 low, high, width, depth = 0.8, 2.0, 0.3, 1.0
@@ -62,7 +64,7 @@ def learn(features):
         if states.iteration[0] % 10 == 0:
             policies.append(states.policy.coef)
 
-    # Movements as short as these are not worth sharing out.
+    # One device is faster here, because the rollouts are short.
     run = {"iterations": 250, "samples": 50, "on_iteration": keep, "devices": jax.local_devices()[:1]}
     cj.train_trials(keys, task, algorithm, start, **run)
     return np.stack(policies)
@@ -72,10 +74,11 @@ rbf, line = cj.rbf_features(low, high, 4), cj.linear_features(1)
 rbf_coefs, line_coefs = learn(rbf), learn(line)
 
 # %% [markdown]
-# ## Watch it learn
+# ## How the policy improves
 #
-# The first trial's policy, without exploration, at three holes it was never told the way to. It stands,
-# learns to come down without hitting the ground, then finds the hole, and last its bottom.
+# The figure shows the mean policy of the first trial, for three holes. At first the arm stands. It then
+# learns to move down without touching the ground, then to enter the hole, and at last to reach the
+# bottom.
 
 # %%
 holes, shown = np.array([0.9, 1.4, 1.9], np.float32), (0, 2, 6, 25)
@@ -99,12 +102,12 @@ for column, index in enumerate(shown):
 plt.show()
 
 # %% [markdown]
-# ## Does it need RBFs?
+# ## RBFs or linear features?
 #
-# Every tenth policy of every trial, at 25 holes; a cross is an arm that touched the ground. In the middle
-# of the range a line does nearly as well. At its far end the line cannot follow and scrapes the edge; at
-# the near end, where the arm has to fold most, both do. Over the paper's narrower range, 1.4 to 2 m, they
-# are alike.
+# The figure shows the stored policies of all trials at 25 holes. A cross means that the arm touched the
+# ground. In the middle of the range the linear policy is nearly as good. At the far end it cannot follow,
+# and the arm touches the edge. At the near end, where the arm must fold most, both policies touch the
+# edge. In the range of the paper, 1.4 to 2 m, both are similar.
 
 # %%
 grid = np.linspace(low, high, 25, dtype=np.float32)
@@ -133,8 +136,8 @@ for name, features, coefs, colour in (
         right.plot(grid[hits], trial[hits], "x", color=colour, markersize=8)
     share = f"{name}: {collides[-1].mean():.0%} touch the ground"
     right.plot([], [], "x-", color=colour, label=share)
-left.set(xlabel="episodes", ylabel="distance (m)", title="From the bottom, mean of all holes", yscale="log")
+left.set(xlabel="episodes", ylabel="distance (m)", title="Mean distance to the bottom", yscale="log")
 left.legend()
-right.set(xlabel="middle of the hole (m)", ylabel="distance (m)", title="At each hole, after learning")
+right.set(xlabel="middle of the hole (m)", ylabel="distance (m)", title="Distance after learning")
 right.legend()
 plt.show()

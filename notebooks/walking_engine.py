@@ -16,9 +16,9 @@
 # %% [markdown]
 # # The walking engine
 #
-# A walk is ten numbers. The engine turns them into joint angles, stage by stage: footsteps, zero moment
-# point (ZMP), centre of mass (CoM), swing foot, joints. No physics yet: this is what the robot *means* to
-# do.
+# Ten parameters define a walk. The engine computes joint angles from them in five stages: footsteps, zero
+# moment point (ZMP), centre of mass (CoM), swing foot, joints. This notebook shows the planned motion,
+# without physics.
 
 # %%
 import sys
@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 
 from creps_jax.tools.process import prepare
 
-prepare()  # It keeps what jax compiles: the next run is quicker.
+prepare()  # Keep compiled programs in a cache, so that the next run starts faster.
 
 import jax
 import jax.numpy as jnp
@@ -47,14 +47,15 @@ from creps_jax.walking.zmp import zmp_reference
 
 # %%
 theta = cj.load(ROOT / "models" / "nao" / "policies" / "walk.npz").theta(0.3)
-print("What the shipped policy answers when asked for 0.3 m/s:")
+print("Parameters of the shipped policy for 0.3 m/s:")
 for name, value, unit in zip(PARAM_NAMES, theta, PARAM_UNITS, strict=True):
     print(f"    {name:15} {value:6.3f} {unit}")
 
 # %% [markdown]
-# Eight steps, compiled as one function of the ten numbers. `plan_walk` goes from footsteps to the CoM,
-# `pose_at` to hips and feet, `pose_joints` to angles. `plan_walk` keeps its ZMP to itself, so we ask for it
-# once more, and then for the ZMP that the planned CoM really has.
+# The next cell compiles eight steps as one function of the ten parameters. `plan_walk` plans from the
+# footsteps to the CoM, `pose_at` computes hips and feet, and `pose_joints` computes the joint angles.
+# `plan_walk` does not return the ZMP. The cell therefore computes the ZMP reference again, and also the
+# ZMP of the planned CoM.
 
 # %%
 NUM_STEPS, NUM_TIMES = 8, 401
@@ -87,10 +88,10 @@ params, plans, asked, real, times, poses, joints = jax.tree.map(np.asarray, engi
 # %% [markdown]
 # ## From footsteps to the centre of mass
 #
-# The ZMP, where the floor pushes back, has to stay under the foot that stands. The CoM cannot jump from
-# foot to foot with it: it sways between them just so that its acceleration puts the ZMP where it is wanted.
-# That is a linear system in the CoM's positions, tridiagonal, solved at once. The dots test it: the ZMP of
-# that CoM is the one that was asked for.
+# The ZMP is the point where the force of the floor acts. It must stay under the standing foot. It moves
+# quickly from foot to foot, but the CoM cannot. The CoM sways between the feet so that its acceleration
+# gives the ZMP of the reference. This is a tridiagonal linear system for the positions of the CoM. The
+# dots are a check: the ZMP of the solved CoM equals the reference.
 
 # %%
 figure, (above, sideways) = plt.subplots(1, 2, figsize=(14, 3.4), width_ratios=(3, 2))
@@ -103,7 +104,7 @@ above.set(xlabel="forward (m)", ylabel="left (m)", title="Eight steps from above
 
 steps = np.arange(NUM_STEPS)[:, None] + np.linspace(0, 1, NUM_NODES)
 clock = params.step_duration * steps
-sideways.plot(clock[:4].ravel(), asked[:4, :, 1].ravel(), color=COLOURS[1], label="ZMP, asked for")
+sideways.plot(clock[:4].ravel(), asked[:4, :, 1].ravel(), color=COLOURS[1], label="ZMP reference")
 sideways.plot(clock[:4, 1:-1].ravel(), real[:4, :, 1].ravel(), "k.", markersize=3, label="ZMP of the CoM")
 sideways.plot(clock[:4].ravel(), plans.com[:4, :, 1].ravel(), color=COLOURS[0], label="CoM")
 sideways.set(xlabel="time (s)", ylabel="left (m)", title="Sideways", ylim=(-0.065, 0.1))
@@ -113,8 +114,9 @@ plt.show()
 # %% [markdown]
 # ## From hips and feet to joints
 #
-# The hips follow the CoM, the swing foot a Bezier curve, and inverse kinematics finds the angles. Posed
-# with them, this is the robot, four times a step (its right side dark). MuJoCo only places the bodies here.
+# The hips follow the CoM. The swing foot follows a Bezier curve. Inverse kinematics gives the joint
+# angles. The figure shows the robot with these angles, four times in each step; its right side is dark.
+# Here MuJoCo only computes the positions of the bodies.
 
 # %%
 model = mujoco.MjModel.from_xml_path(str(ROOT / "models" / "nao" / "nao.xml"))
@@ -145,12 +147,13 @@ figure, panel = plt.subplots(figsize=(13, 3.4))
 for count, index in enumerate(range(250, 351, 12)):
     sketch(panel, poses.hips[index], joints[index], 0.22 * count)
 panel.axhline(0, color="black", linewidth=0.8)
-panel.set(ylabel="height (m)", title="Two steps, pulled apart", aspect="equal", xticks=[])
+panel.set(ylabel="height (m)", title="Two steps; postures are moved apart", aspect="equal", xticks=[])
 plt.show()
 
 # %% [markdown]
-# Do the joints allow it? All but the ankle's pitch: with knees as bent as these, it stops at 75 degrees
-# (dotted lines: the limits) in the middle of each swing, and the lifted toe hangs a little.
+# The next figure compares the angles with the limits of the joints (dotted lines). Only the ankle pitch
+# reaches its limit: because the knees are strongly bent, it stops at 75 degrees in the middle of each
+# swing, and the toe of the swing foot points slightly down.
 
 # %%
 figure, axes = plt.subplots(2, 3, figsize=(12, 5), sharex=True)
@@ -168,9 +171,9 @@ axes[0, 0].legend(loc="center right")
 plt.show()
 
 # %% [markdown]
-# ## What a parameter does
+# ## The effect of single parameters
 #
-# Three values of one parameter each; all others stay.
+# Each figure varies one parameter over three values. All other parameters stay the same.
 
 # %%
 figure, (sway, zmp, foot) = plt.subplots(1, 3, figsize=(14, 3.6))
@@ -190,8 +193,8 @@ for style, (*_, poses, _) in vary("swing_height", (0.02, 0.04, 0.06)):
     foot.plot(poses.left[250:301, 0], poses.left[250:301, 2], **style)
 sway.set(xlabel="time (steps)", ylabel="CoM, left (m)", title="Slow steps sway more")
 sway.legend(title="step_duration (s)")
-zmp.set(xlabel="time (steps)", ylabel="ZMP, left (m)", title="Both feet stand: weight shifts slowly")
+zmp.set(xlabel="time (steps)", ylabel="ZMP, left (m)", title="More double support: a slower shift")
 zmp.legend(title="double_support (s)")
-foot.set(xlabel="forward (m)", ylabel="left sole, up (m)", title="The swing foot's arc", ylim=(0, 0.1))
+foot.set(xlabel="forward (m)", ylabel="left sole, up (m)", title="Path of the swing foot", ylim=(0, 0.1))
 foot.legend(title="swing_height (m)", ncols=3)
 plt.show()

@@ -16,8 +16,9 @@
 # %% [markdown]
 # # Your own robot
 #
-# A simulator that jax cannot trace, a real robot, a person with a tape measure: whatever answers "how good
-# was that?" can be learned with. `ask` proposes, you measure, `tell` learns.
+# The search does not need a task in JAX. It works with any source of rewards: another simulator, a real
+# robot, or measurements by a person. `ask` proposes parameters, you measure their rewards, and `tell`
+# updates the policy.
 
 # %%
 import sys
@@ -28,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 
 from creps_jax.tools.process import prepare
 
-prepare()  # It keeps what jax compiles: the next run is quicker.
+prepare()  # Keep compiled programs in a cache, so that the next run starts faster.
 
 import jax
 import jax.numpy as jnp
@@ -42,11 +43,12 @@ from creps_jax.tools.plots import COLOURS, PAPER_COLOUR
 # %% [markdown]
 # ## A robot in plain Python
 #
-# It throws a ball over a wall, to land as far away as it is asked. It is a robot: the arm trembles, and of
-# ten throws the camera loses one. That one is NaN, and will be ignored.
+# The robot throws a ball over a wall. The ball should land at a given distance, the context. Speed and
+# angle of each throw have noise. In one of ten throws the camera loses the ball. The reward of this throw
+# is NaN, and the search ignores it.
 
 # %%
-WALL, TOP = 2.0, 2.5  # Where the wall stands, and how high, m.
+WALL, TOP = 2.0, 2.5  # Position and height of the wall, m.
 rng = np.random.default_rng(0)
 
 
@@ -64,7 +66,7 @@ def throw(speed, angle):
 
 
 def measure(wanted, speed, angle):
-    """Return the reward of one throw: how close it landed, and how gently it was thrown."""
+    """Return the reward of one throw: it is higher for a smaller distance error and a lower speed."""
     if rng.random() < 0.1:
         return np.nan
     landed = throw(speed + 0.05 * rng.normal(), angle + 0.5 * rng.normal())[-1, 0]
@@ -74,8 +76,8 @@ def measure(wanted, speed, angle):
 # %% [markdown]
 # ## Learn from 20 throws at a time
 #
-# The learner thinks in numbers without bounds; `sigmoid_gate` squashes them into what the arm can do. Tell
-# it what it asked for, not what came out of the gate.
+# The search uses real numbers without bounds. `sigmoid_gate` maps them into the bounds of the arm. Give
+# `tell` the numbers that `ask` returned, not the mapped ones.
 
 # %%
 near, far = 3.0, 8.0
@@ -102,10 +104,11 @@ def learn(state, log, iterations):
 state, log = learn(algorithm.init(start), np.zeros((0, 20)), 15)
 
 # %% [markdown]
-# ## Stop, and go on tomorrow
+# ## Stop, and continue later
 #
-# The state is all there is: policy, archive, number of iterations. A checkpoint is written whole or not at
-# all, and refuses to be loaded into another run.
+# The state contains the whole search: policy, archive, number of iterations. `save_checkpoint` writes it
+# to a file. An interrupted write leaves no incomplete file. `load_checkpoint` refuses the checkpoint of
+# another run.
 
 # %%
 path, run = ROOT / "results" / "ball.npz", {"robot": "ball", "seed": 0}
@@ -116,13 +119,13 @@ state, log = learn(state, saved["rewards"], 25)
 print(f"{state.iteration} iterations, {log.size} throws, {np.isnan(log).sum()} of them lost")
 
 # %% [markdown]
-# ## What it learned
+# ## The learned policy
 
 # %%
 figure, (curve, speeds, angles) = plt.subplots(1, 3, figsize=(14, 3.6))
-curve.plot(-log.ravel(), ".", color=COLOURS[0], alpha=0.4, markersize=4, label="a throw")
+curve.plot(-log.ravel(), ".", color=COLOURS[0], alpha=0.4, markersize=4, label="one throw")
 curve.plot(np.arange(20, 801, 20), -np.nanmedian(log, axis=1), color=COLOURS[1], label="median of 20")
-curve.axvline(300, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label="saved, loaded")
+curve.axvline(300, color=PAPER_COLOUR, linestyle="--", linewidth=1.2, label="saved and loaded")
 curve.set(xlabel="throws", ylabel="-reward", title="Learning curve", yscale="log")
 curve.legend(fontsize=8)
 
@@ -132,9 +135,9 @@ low, middle, high = (arm(jnp.asarray(mean + share * std)).T for share in (-2, 0,
 for index, (panel, name) in enumerate(((speeds, "speed (m/s)"), (angles, "angle (deg)"))):
     panel.fill_between(grid[:, 0], low[index], high[index], color=COLOURS[0], alpha=0.2, linewidth=0)
     panel.plot(grid[:, 0], middle[index], color=COLOURS[0])
-    panel.set(xlabel="distance asked for (m)", ylabel=name, ylim=(LOW[index], HIGH[index]))
-speeds.set_title("The policy, ±2 std: how fast")
-angles.set_title("... and how steep")
+    panel.set(xlabel="asked distance (m)", ylabel=name, ylim=(LOW[index], HIGH[index]))
+speeds.set_title("Speed of the policy, ±2 std")
+angles.set_title("Angle of the policy, ±2 std")
 plt.show()
 
 # %%
@@ -148,7 +151,7 @@ for speed, angle in first:
 for target, (speed, angle), colour in zip(targets, last, COLOURS, strict=False):
     after.plot(*throw(speed, angle).T, color=colour)
     after.plot(target, 0, "v", color=colour, markersize=12, clip_on=False)
-for panel, title in ((before, "What it tries at first"), (after, "What it learned, for four distances")):
+for panel, title in ((before, "Throws before learning"), (after, "Throws after learning, four distances")):
     panel.plot([WALL, WALL], [0, TOP], color="black", linewidth=4)
     panel.set(xlabel="distance (m)", title=title, xlim=(0, 9), ylim=(0, 5), aspect="equal")
 before.set_ylabel("height (m)")
