@@ -14,6 +14,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+import creps_jax
 from creps_jax.files import policies_folder
 from creps_jax.tools import cli
 from experiments import registry
@@ -109,6 +110,13 @@ def test_files_that_a_page_names_are_there(page):
     assert not [name for name in named if not any((folder / name).is_file() for folder in folders)]
     links = re.findall(r"\]\(([^)#:\s]+)\)", text)
     assert not [link for link in links if not ((ROOT / page).parent / link).exists()]
+
+
+def test_changelog_citation_and_package_have_one_version():
+    citation, changelog = (ROOT / "CITATION.cff").read_text(), (ROOT / "CHANGELOG.md").read_text()
+    cited = re.findall(r"^(?:version|date-released): (\S+)$", citation, re.MULTILINE)
+    released = re.findall(r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$", changelog, re.MULTILINE)
+    assert tuple(cited) == released[0] and released[0][0] == creps_jax.__version__
 
 
 def test_the_page_of_equations_says_where_they_are():
