@@ -12,22 +12,22 @@ TAG = re.compile(r"# Eq\. (\d+)$")
 
 WHAT = {
     1: "ZMP of a pendulum whose length changes, along x",
-    2: "the same along y",
-    3: "height of the CoM: an oscillation of the spring",
-    4: "its acceleration",
+    2: "ZMP of the same pendulum, along y",
+    3: "height of the CoM: oscillation of the spring",
+    4: "vertical acceleration of the CoM",
     5: "central difference for the acceleration of the CoM",
     6: "tridiagonal system for the positions of the CoM",
     7: "Thomas algorithm: coefficients above the diagonal",
     8: "Thomas algorithm: right-hand side",
     9: "Thomas algorithm: back substitution",
-    10: "the bound on the relative entropy of a policy",
-    11: "its dual function for one context",
-    12: "the same for samples of contexts and parameters, and the weights that solve it",
-    13: "the dual function of temperature and baseline",
+    10: "bound on the relative entropy of a policy",
+    11: "dual function of Eq. 10, for one context",
+    12: "bound on the relative entropy for samples of contexts and parameters, and the optimal weights",
+    13: "dual function of Eq. 12, of temperature and baseline",
     14: "coefficients of the policy's mean",
     15: "covariance of the policy, and Z",
     16: "normalised radial basis functions",
-    17: "squash parameters into their bounds by a sigmoid",
+    17: "map parameters into their bounds by a sigmoid",
     18: "reward of a walk",
 }
 NOT_COMPUTED = {
@@ -55,10 +55,11 @@ def page() -> str:
         rows.append(f"| {number} | {WHAT[number]} | {where} |")
     return "\n".join(
         [
-            "# Which line computes which equation",
+            "# Equations, and the lines that compute them",
             "",
-            "Equations of Abdolmaleki et al. 2016. Where the code has a numerically safer form, or the print",
-            "a misprint (see [Deviations](deviations.md)), a comment above the line has the printed form.",
+            "The equations are those of Abdolmaleki et al. 2016. If the code uses a numerically safer form,",
+            "or the printed equation has a misprint (see [Deviations](deviations.md)), a comment above the",
+            "line shows the printed form.",
             "",
             "| equation | what it is | file and line |",
             "|---|---|---|",
