@@ -23,7 +23,7 @@ from .tasks.base import Outcome, PlainOutcome, Task, average_repeats, penalised,
 from .tasks.planar_arm import hole_reaching, via_point_reaching
 from .tasks.sine import sinus
 from .tasks.walking import nao_walk
-from .training import IterationLog, evaluate, make_iteration, train, train_trials
+from .training import IterationLog, evaluate, learned, make_iteration, train, train_trials
 from .walking.com import com_trajectory
 from .walking.params import NAO_BOUNDS
 
@@ -58,6 +58,7 @@ __all__ = [
     "fit_weighted_ml",
     "gaussian_contexts",
     "hole_reaching",
+    "learned",
     "leg_fk",
     "leg_ik",
     "linear_features",

@@ -4,7 +4,7 @@ Every random number of a run follows from its key and the number of the iteratio
 loop and a resumed run draw the same ones. Rollouts are shared out over the devices.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from jaxtyping import Key, UInt32
 
 from creps_jax import checks
 from creps_jax.keys import threefry
+from creps_jax.policies.learned import Learned
 from creps_jax.rollouts import (
     Devices,
     compiled_roll_out,
@@ -29,10 +30,11 @@ from creps_jax.rollouts import (
 )
 from creps_jax.search.archive import Batch
 from creps_jax.search.base import Search, SearchState
+from creps_jax.search.creps import Creps
 from creps_jax.tasks.base import Task
 from creps_jax.typing import Array, Float, IntScalar, PRNGKey, Scalar
 
-__all__ = ["IterationLog", "Samples", "evaluate", "make_iteration", "train", "train_trials"]
+__all__ = ["IterationLog", "Samples", "evaluate", "learned", "make_iteration", "train", "train_trials"]
 
 OnIteration = Callable[[Any, "IterationLog"], Any]
 """Called as (state, log) after an iteration; if it returns True, the run ends there."""
@@ -241,6 +243,39 @@ def evaluate(
     contexts, thetas = (jnp.repeat(x, repeats, axis=0) for x in (contexts, thetas))
     outcomes, _ = compiled_roll_out(task, chosen)(key, contexts, thetas)
     return jax.tree.map(lambda x: x.reshape(num, repeats, *x.shape[1:]), outcomes)
+
+
+@checks.arguments
+def learned(
+    task: Task, algorithm: Creps, state: Any, *, made_for: Mapping[str, Any] | None = None
+) -> Learned:
+    """Put the policy of a state together with what the task states of contexts and parameters.
+
+    The result describes itself: it returns parameters by name, in their units and bounds, and can be saved.
+
+    Args:
+        task: The task that was learned, with `contexts` and `parameters`. Those of this library have them,
+            and `sigmoid_constrained` and `penalised` put their bounds in.
+        algorithm: What learned it, made by `creps`.
+        state: The state after `train`.
+        made_for: Plain values to keep with the policy, such as the name of the task and its settings.
+
+    Returns:
+        The learned policy.
+
+    Raises:
+        ValueError: If the task does not state its contexts and parameters, or the policy is of another kind
+            than `LinearGaussian`.
+    """
+    if task.contexts is None or task.parameters is None:
+        missing = "contexts" if task.contexts is None else "parameters"
+        raise ValueError(f"the task must state its {missing}, Task(..., {missing}=Space(...)), got None")
+    if algorithm.settings is None:
+        raise ValueError("algorithm must be made by creps(), got one with other functions")
+    made_for = {} if made_for is None else made_for
+    checks.instance("made_for", made_for, Mapping)
+    features = algorithm.settings.kind.features
+    return Learned(algorithm.policy(state), features, task.contexts, task.parameters, made_for)
 
 
 class _Setup(NamedTuple):

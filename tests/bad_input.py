@@ -327,8 +327,9 @@ RUN = {
     "devices": DEVICES,
 }
 
+SPACES = cj.Space("x", 0.0, 1.0), cj.Space(("a", "b"), (0.0, 0.0), (1.0, 1.0))
 SPEED = cj.Space(("speed",), (0.0,), (1.0,), ("m/s",))
-LEARNED = cj.Learned(POLICY, FEATURES, SPEED, cj.Space(("a", "b"), (0.0, 0.0), (1.0, 1.0)))
+LEARNED = cj.Learned(POLICY, FEATURES, SPEED, SPACES[1])
 FOLDER = Path(tempfile.mkdtemp())
 LEARNED.save(FOLDER / "policy.npz")
 NO_PATH = one_of((None, "None"), (5, "5"), (["a"], "['a']"))
@@ -535,6 +536,8 @@ ROWS = {
         context_dim=count(S),
         theta_dim=count(D),
         worst_reward=number(-10.0),
+        contexts=optional(record(SPACES[0])),
+        parameters=optional(record(SPACES[1])),
     ),
     "average_repeats": row(cj.average_repeats, use=use_task, task=record(TASK), repeats=count(3)),
     "bounded_ml": row(
@@ -658,6 +661,14 @@ ROWS = {
         features=record(FEATURES),
         m_step=function(weighted_ml),
         ridge=number(0.1, least=0.0),
+    ),
+    "learned": row(
+        cj.learned,
+        use=lambda made: made.policy,
+        task=record(dataclasses.replace(TASK, contexts=SPACES[0], parameters=SPACES[1])),
+        algorithm=record(ALGORITHM, (cj.creps, "creps")),
+        state=state(),
+        made_for=optional(Argument({}, one_of((5, "5"), ("walk", "walk")))),
     ),
     "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
     "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),

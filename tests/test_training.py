@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from creps_jax import tasks
 from creps_jax.policies.features import linear_features, quadratic_features
-from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian, start_policy
+from creps_jax.policies.learned import load
 from creps_jax.search.archive import push
 from creps_jax.search.creps import CrepsState, creps
-from creps_jax.tasks import Task
-from creps_jax.training import evaluate, make_iteration, train, train_trials
+from creps_jax.tasks import Task, penalised, sigmoid_constrained
+from creps_jax.training import evaluate, learned, make_iteration, train, train_trials
 from tests.compilations import count_compilations
 
 SAMPLES, FIRST_SAMPLES, ITERATIONS = 15, 25, 7
@@ -317,3 +319,37 @@ def test_evaluation_refuses_what_does_not_fit(key):
         evaluate(key, TASK, jnp.zeros((4, 1)), jnp.zeros((4, 3)))
     with pytest.raises(ValueError, match="repeats must be at least 1, got 0"):
         evaluate(key, TASK, jnp.zeros((4, 1)), jnp.zeros((4, 2)), repeats=0)
+
+
+@pytest.mark.parametrize("make", [tasks.sinus, tasks.via_point_reaching, tasks.hole_reaching, tasks.nao_walk])
+def test_a_state_becomes_a_policy_with_the_names_and_units_of_its_task(make, tmp_path):
+    task = sigmoid_constrained(make(), -2.0, 3.0)
+    features = linear_features(task.context_dim)
+    algorithm = creps(features)
+    state = algorithm.init(start_policy(features, task.theta_dim, std=0.1))
+    found = learned(task, algorithm, state, made_for={"name": "mine"})
+    found.save(tmp_path / "policy.npz")
+    found = load(tmp_path / "policy.npz")
+    assert found.contexts == task.contexts
+    assert found.task == {"name": "mine"}
+    middle = 0.5 * (np.array(task.contexts.low) + np.array(task.contexts.high))
+    parameters = found(*middle)
+    assert tuple(parameters) == task.parameters.names
+    np.testing.assert_allclose(list(parameters.values()), 0.5)  # the sigmoid's middle
+    assert len(task.parameters.units) == task.theta_dim
+
+
+def test_clipped_parameters_of_a_penalised_task_stay_in_its_bounds():
+    task = penalised(tasks.sinus(), -0.5, 0.5, 1.0)
+    features = linear_features(1)
+    algorithm = creps(features)
+    found = learned(task, algorithm, algorithm.init(start_policy(features, 1, mean=2.0, std=0.1)))
+    assert found(1.0) == {"sine": 0.5}
+
+
+def test_a_task_that_does_not_state_its_variables_cannot_make_a_learned_policy():
+    task = dataclasses.replace(tasks.sinus(), parameters=None)
+    algorithm = creps(linear_features(1))
+    state = algorithm.init(start_policy(linear_features(1), 1))
+    with pytest.raises(ValueError, match="the task must state its parameters"):
+        learned(task, algorithm, state)

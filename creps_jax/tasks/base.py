@@ -16,6 +16,7 @@ import numpy as np
 
 from creps_jax import checks
 from creps_jax.policies import space
+from creps_jax.policies.space import Space
 from creps_jax.programs import KeepsPrograms
 from creps_jax.typing import Array, Float, PRNGKey, VectorLike
 
@@ -67,6 +68,8 @@ class Task(KeepsPrograms):
         context_dim: Number s of context variables.
         theta_dim: Number d of parameters.
         worst_reward: The finite reward put in place of one that is not finite.
+        contexts: Names, units and ranges of the context variables, for `learned`; None if not stated.
+        parameters: Names, units and bounds of the parameters, for `learned`; None if not stated.
     """
 
     sample_context: Callable[[PRNGKey], Array]
@@ -74,6 +77,8 @@ class Task(KeepsPrograms):
     context_dim: int
     theta_dim: int
     worst_reward: float | int
+    contexts: Space | None = None
+    parameters: Space | None = None
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -83,6 +88,10 @@ class Task(KeepsPrograms):
         checks.count("theta_dim", self.theta_dim)
         # An array could not be compiled for.
         object.__setattr__(self, "worst_reward", checks.number("worst_reward", self.worst_reward))
+        for name, size in (("contexts", self.context_dim), ("parameters", self.theta_dim)):
+            stated = getattr(self, name)
+            if stated is not None and (not isinstance(stated, Space) or stated.size != size):
+                raise ValueError(f"{name} must be a Space of {size} variables, got {checks.shown(stated)}")
 
     @functools.cached_property
     def programs(self) -> dict[Any, Any]:
@@ -159,7 +168,8 @@ def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
         theta = checks.array("theta", theta, (task.theta_dim,))
         return task.rollout(key, context, space.sigmoid_gate(theta, low, high))
 
-    return dataclasses.replace(task, rollout=rollout)
+    parameters = _bounded(task.parameters, low, high, "sigmoid")
+    return dataclasses.replace(task, rollout=rollout, parameters=parameters)
 
 
 @checks.arguments
@@ -192,7 +202,15 @@ def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | in
         reward = outcome.reward - space.penalty(violation, penalty)  # Eq. 18
         return outcome._replace(reward=reward, violation=violation)
 
-    return dataclasses.replace(task, rollout=rollout, worst_reward=task.worst_reward - penalty)
+    worst_reward, parameters = task.worst_reward - penalty, _bounded(task.parameters, low, high, "clip")
+    return dataclasses.replace(task, rollout=rollout, worst_reward=worst_reward, parameters=parameters)
+
+
+def _bounded(parameters: Space | None, low: np.ndarray, high: np.ndarray, constraint: str) -> Space | None:
+    if parameters is None:
+        return None
+    low, high = tuple(low.tolist()), tuple(high.tolist())
+    return dataclasses.replace(parameters, low=low, high=high, constraint=constraint)
 
 
 def _mean_of_repeats(field: Array) -> Array:

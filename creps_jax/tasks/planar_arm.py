@@ -6,9 +6,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
+from creps_jax.policies.space import Space
 from creps_jax.tasks.base import PlainOutcome, Task
 from creps_jax.tasks.dmp import DmpTrajectory, dmp_trajectory
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar, ScalarLike, VectorLike
@@ -91,7 +93,9 @@ def via_point_reaching(
         reward = -1e4 * miss - 0.5 * jnp.sum(jnp.square(movement.acc))
         return PlainOutcome(reward, jnp.zeros(0, theta.dtype))
 
-    return Task(sample_context, rollout, context_dim=2, theta_dim=NUM_BASIS * NUM_LINKS, worst_reward=-1e7)
+    contexts = Space(("via_x", "via_y"), *_tuples(low, high), ("m", "m"))
+    parameters = _dmp_parameters(num_goals=0)
+    return Task(sample_context, rollout, 2, parameters.size, -1e7, contexts, parameters)
 
 
 @checks.arguments
@@ -146,8 +150,8 @@ def hole_reaching(
         reward = -1e5 * (missed + num_collisions) - 10.0 * jnp.sum(jnp.square(movement.acc))
         return HoleOutcome(reward, jnp.zeros(0, theta.dtype), num_collisions, jnp.sqrt(last))
 
-    theta_dim = (NUM_BASIS + 1) * NUM_LINKS
-    return Task(sample_context, rollout, context_dim=1, theta_dim=theta_dim, worst_reward=-1e8)
+    contexts, parameters = Space(("hole_x",), (low,), (high,), ("m",)), _dmp_parameters(num_goals=NUM_LINKS)
+    return Task(sample_context, rollout, 1, parameters.size, -1e8, contexts, parameters)
 
 
 @checks.arguments
@@ -205,6 +209,18 @@ def hits_ground(
     is_in_hole = (jnp.abs(points[:, 0] - center) <= 0.5 * width) & (points[:, 1] >= -depth)
     crosses_in_hole = jnp.abs(crossing - center) <= 0.5 * width
     return jnp.any(is_below & ~is_in_hole) | jnp.any(passes & ~crosses_in_hole)
+
+
+def _tuples(*ends: VectorLike) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(np.ravel(np.asarray(end, float)).tolist()) for end in ends)
+
+
+def _dmp_parameters(*, num_goals: int) -> Space:
+    """Name the weights of each basis and joint, and the goals of the first joints."""
+    weights = [f"weight_{basis + 1}_{joint + 1}" for basis in range(NUM_BASIS) for joint in range(NUM_LINKS)]
+    names = (*weights, *(f"goal_{joint + 1}" for joint in range(num_goals)))
+    free = (math.inf,) * len(names)
+    return Space(names, tuple(-end for end in free), free, ("rad",) * len(names))
 
 
 def _movement(weights: Array, goal: Array) -> DmpTrajectory:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 
 from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
+from creps_jax.policies.space import Space
 from creps_jax.tasks.base import PlainOutcome, Task
 from creps_jax.typing import Array, Float, PRNGKey
 
@@ -45,4 +46,6 @@ def sinus(low: float = 0.0, high: float = 5 * math.pi) -> Task:
         context_dim=1,
         theta_dim=1,
         worst_reward=-100.0,
+        contexts=Space(("angle",), (low,), (high,), ("rad",)),
+        parameters=Space(("sine",), (-math.inf,), (math.inf,)),
     )

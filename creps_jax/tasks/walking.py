@@ -15,6 +15,7 @@ from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
 from creps_jax.files import models_folder
 from creps_jax.numerics.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
+from creps_jax.policies.space import Space
 from creps_jax.robots.nao_geometry import NUM_JOINTS, NaoGeometry
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.simulation import mjx
@@ -32,7 +33,7 @@ from creps_jax.tasks.conditions import (
 )
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
 from creps_jax.walking.engine import BodyPose, plan_walk, pose_at, pose_joints, stand_upright
-from creps_jax.walking.params import PARAM_NAMES, WalkParams, count_steps, params_from_theta
+from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS, WalkParams, count_steps, params_from_theta
 from creps_jax.walking.posture import Balance
 from creps_jax.walking.set_points import next_set_point
 
@@ -268,7 +269,15 @@ def nao_walk(
 
     # A fall at twice the highest speed in the wrong direction.
     worst = -(reward.fall + reward.speed * (3.0 * high) ** 2)
-    return Task(sample_context, rollout, 1 + len(conditions), theta_dim=len(PARAM_NAMES), worst_reward=worst)
+    contexts = Space(
+        ("speed", *(c.name for c in conditions)),
+        (low, *(c.low for c in conditions)),
+        (high, *(c.high for c in conditions)),
+        ("m/s", *(c.unit for c in conditions)),
+    )
+    free = (math.inf,) * len(PARAM_NAMES)
+    parameters = Space(PARAM_NAMES, tuple(-end for end in free), free, PARAM_UNITS)
+    return Task(sample_context, rollout, contexts.size, parameters.size, worst, contexts, parameters)
 
 
 @checks.arguments
