@@ -313,6 +313,7 @@ FIT = {
     "ridge": number(0.1, least=0.0),
     "scale": optional(array(np.ones(2))),
     "start": optional(array(np.zeros((2, D)))),
+    "constant": optional(array(np.array([1.0, 0.0]))),
 }
 SAMPLES = {"reward": array(REWARDS, bears=ANY), "features": array(CONTEXTS, free=(1,), bears=ANY)}
 RUN = {

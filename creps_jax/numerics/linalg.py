@@ -1,9 +1,8 @@
-"""Solve the small linear systems of the library: tridiagonal, regression, Cholesky, whitening."""
+"""Solve the small linear systems of the library: tridiagonal, Cholesky, whitening."""
 
 import math
 from typing import TypeAlias
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -22,7 +21,6 @@ __all__ = [
     "thomas_solve",
     "times_power",
     "weighted_mean",
-    "weighted_ridge",
     "whitened_regression",
 ]
 
@@ -88,61 +86,6 @@ def thomas_solve(
     _, reduced = lax.scan(eliminate, (zero, zero), (lower, diag, upper, rhs))
     _, solution = lax.scan(substitute, zero, reduced, reverse=True)
     return checks.finite("the solution, for which lower, diag and upper have to leave all pivots,", solution)
-
-
-def weighted_ridge(
-    features: Float[Array, "n p"],
-    targets: Float[Array, "n d"],
-    weights: Float[Array, " n"],
-    *,
-    ridge: ScalarLike,
-    scale: Float[Array, " p"] | None = None,
-) -> Float[Array, "p d"]:
-    """Fit targets by a linear function of features under a ridge relative to the size of each feature.
-
-    Minimises `sum_i d_i |y_i - B' x_i|^2 / sum_i d_i + ridge sum_j q_j |B_j|^2`, where q_j is the square of
-    feature j's scale, so that the fit does not depend on the units of features or targets. An orthogonal
-    factorisation bears features on a large offset, which normal equations in float32 do not.
-
-    Args:
-        features: Features x, one row a sample.
-        targets: Targets y, one row a sample.
-        weights: Weights d of the samples, not negative; a sample of weight zero may hold anything.
-        ridge: Strength of the penalty, not negative. Zero is raised to the resolution of the format, which
-            keeps the fit finite with collinear features or fewer samples than features.
-        scale: Size of each feature, above zero; by default the root of its weighted mean square. A feature
-            that is nearly zero on all samples is then hardly penalised: where it can be large, say so.
-
-    Returns:
-        The coefficients B.
-
-    Raises:
-        ValueError: If the numbers of samples differ.
-    """
-    num_samples, num_features = features.shape
-    if targets.shape[0] != num_samples or weights.shape != (num_samples,):
-        raise ValueError(
-            "weighted_ridge needs features (n, p), targets (n, d) and weights (n,), "
-            f"got shapes {features.shape}, {targets.shape} and {weights.shape}"
-        )
-    if scale is not None and scale.shape != (num_features,):
-        raise ValueError(f"scale must have shape ({num_features},), got {scale.shape}")
-    eps = jnp.finfo(features.dtype).eps
-    is_weighted = (weights > 0)[:, None]
-    total = jnp.sum(weights)
-    root = safe_sqrt(jnp.where(is_weighted, weights[:, None], 0.0) / jnp.where(total > 0, total, 1.0))
-    rows = root * jnp.where(is_weighted, features, 0.0)
-    values = root * jnp.where(is_weighted, targets, 0.0)
-    size = safe_sqrt(jnp.sum(rows**2, axis=0)) if scale is None else scale
-    size = jnp.asarray(jnp.where(size > 0, size, 1.0))
-    damping, least = jnp.sqrt(jnp.asarray(ridge, features.dtype)), math.sqrt(num_features) * 4.0 * eps
-    # Beside the features the targets Y turn to Q' Y, for which Q is not needed. Their own rows of the penalty
-    # change nothing: the factor has an inverse, and with it a gradient, where features fit the targets.
-    penalty = jnp.full(num_features + targets.shape[1], least, features.dtype).at[:num_features].add(damping)
-    both = jnp.concatenate([rows / size[None, :], values], axis=1)
-    triangular = jnp.linalg.qr(jnp.concatenate([both, jnp.diag(penalty)]), mode="r")[:num_features]
-    left, right = triangular[:, :num_features], triangular[:, num_features:]
-    return jax.scipy.linalg.solve_triangular(left, right) / size[:, None]
 
 
 def normalised(weights: Float[Array, " n"]) -> Float[Array, " n"]:

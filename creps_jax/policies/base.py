@@ -19,6 +19,8 @@ class WeightedSamples(NamedTuple):
     """Weights d, which sum to one; a sample of weight zero may hold anything."""
     is_valid: Bool[Array, " n"]
     """Which samples count: over their contexts relative entropies are averaged."""
+    constant: Float[Array, " p"] | None = None
+    """Coefficients whose sum with the features is one, see `FeatureMap.constant`; None if not stated."""
 
 
 class Policy(NamedTuple):

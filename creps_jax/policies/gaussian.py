@@ -182,38 +182,47 @@ def fit_weighted_ml(
     ridge: ScalarLike,
     scale: Float[Array, " p"] | None = None,
     start: Float[Array, "p d"] | None = None,
+    constant: Float[Array, " p"] | None = None,
 ) -> LinearGaussian:
     """Fit the policy to weighted samples by maximum likelihood.
 
+    With the features as rows of Phi, the parameters as rows of U and the weights on the diagonal of D, the
+    coefficients are `A = (Phi' D Phi)^-1 Phi' D U` (Eq. 14), here with a ridge, and the covariance is
+    `Sigma = sum_i d_i (theta_i - A' phi_i) (theta_i - A' phi_i)' / Z` (Eq. 15).
+
     The fit does not depend on the units and zeros of parameters and features. The ridge shrinks the policy
-    towards the weighted mean of theta (as far as the features can express a constant), not towards zero: it
-    penalises how the mean changes with the context. Powers of a context are other features for another zero
-    of the context, and the ridge holds them otherwise: with them, measure the context from the middle of its
+    towards the weighted mean of theta (if the features can express a constant), not towards zero: it
+    penalises how the mean changes with the context. If the zero of the context moves, its powers become other
+    features, which the ridge penalises differently: with powers, measure the context from the middle of its
     range, or set the ridge to zero.
 
     Args:
         features: Policy features varphi of the context of each sample.
         theta: Parameters of each sample.
         weights: Weights d of the samples, not negative; a sample of weight zero may hold anything.
-        ridge: Penalty on the coefficients, but for those that make a constant, relative to the square of
-            each feature's scale; may be zero.
-        scale: Size of each feature, see `weighted_ridge`; by default its standard deviation.
-        start: Coefficients from which the ridge counts, those of the last policy: what a ridge towards a
-            constant takes away in each of many updates adds up. By default that constant.
+        ridge: Penalty on the coefficients, except along `constant`, relative to the square of each feature's
+            scale; may be zero.
+        scale: Size of each feature, above zero; by default its standard deviation. A feature that hardly
+            varies in the samples but can vary outside of them is then hardly penalised: give its scale.
+        start: Coefficients of the last policy. The ridge penalises the change from them: a ridge towards a
+            constant would accumulate over many updates. By default the ridge is towards a constant.
+        constant: Coefficients whose sum with the features is one, see `FeatureMap.constant`. By default they
+            are taken from the samples: ones, if the features sum to one, else the inverse of the first
+            feature that has one value in all samples, else none.
 
     Returns:
-        The policy. Its covariance is taken about its own, context-dependent mean, and unbiased however many
-        features the mean has. It is finite and positive definite for any weights: what too few samples leave
-        open is filled in as small as rounding allows.
+        The policy. Its covariance is taken about its own, context-dependent mean, and is unbiased for any
+        number of features. It is finite and positive definite for any weights: directions that too few
+        samples leave undetermined get the smallest spread that rounding allows.
 
     Raises:
         ValueError: If shapes do not fit each other, or a number is out of its range.
 
     Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
     """
-    fit = regress(features, theta, weights, ridge=ridge, scale=scale, start=start)
-    coef = as_coefficients(fit.basis, fit.solution.at[0].add(fit.centre), fit.size)
-    coef = coef if start is None else start + coef
+    fit = regress(features, theta, weights, ridge=ridge, scale=scale, start=start, constant=constant)
+    change = as_coefficients(fit.basis, fit.solution.at[0].add(fit.centre), fit.size)
+    coef = change if start is None else start + change
     return LinearGaussian(coef, fit.size[:, None] * _weighted_cov_chol(fit))
 
 
@@ -258,7 +267,7 @@ def linear_gaussian(
         log_prob=_log_prob_rows,
         kl=_kl_rows,
         entropy=entropy,
-        fit=_Fit(m_step, ridge, features.scale),
+        fit=_Fit(m_step, ridge, features.scale, features.constant),
         blend=_blend,
         noise=_whitened,
         checked=checked,
@@ -272,9 +281,14 @@ class _Fit:
     m_step: Callable[..., LinearGaussian]
     ridge: float | int
     scale: tuple[float, ...] | None
+    constant: tuple[float, ...] | None
 
     def __call__(self, policy: LinearGaussian, samples: WeightedSamples) -> LinearGaussian:
-        scale = None if self.scale is None else jnp.asarray(self.scale, samples.theta.dtype)
+        scale, constant = (
+            None if numbers is None else jnp.asarray(numbers, samples.theta.dtype)
+            for numbers in (self.scale, self.constant)
+        )
+        samples = samples._replace(constant=constant)
         fitted = self.m_step(policy, samples, ridge=self.ridge, scale=scale)
         checks.instance("what m_step returns", fitted, LinearGaussian)
         for field, values in policy._asdict().items():

@@ -1,8 +1,8 @@
-"""Regress parameters on features, whatever the units and zeros of both: the mean of the policy, Eq. 14.
+"""Regress parameters on features, in any units and from any zero of both: the mean of the policy, Eq. 14.
 
 Features such as `[1, s, s^2, s^3]` differ by powers of a unit, and far from the zero of s they are nearly
-collinear. The regression therefore has coordinates of its own: what is nearest to a constant, and the slopes
-about it, each in the unit of its feature. Only the result is converted.
+collinear. The regression therefore uses coordinates of its own: a constant, and the distance of each feature
+from its mean, in the unit of the feature. Only the result is converted.
 """
 
 from typing import NamedTuple
@@ -12,47 +12,41 @@ import jax.numpy as jnp
 from jax import lax
 
 from creps_jax import checks
-from creps_jax.numerics.linalg import (
-    exact_dot,
-    normalised,
-    safe_norm,
-    safe_sqrt,
-    weighted_mean,
-    weighted_ridge,
-)
+from creps_jax.numerics.linalg import exact_dot, normalised, safe_norm, safe_sqrt, weighted_mean
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
 __all__ = ["Basis", "Regression", "as_coefficients", "coordinates", "normaliser", "regress"]
 
 _ROUNDING = 2.0
-"""Spread of a feature, in units of its rounding, that may be rounding."""
-_SUM_IS_ONE = 1e-4
-"""Largest distance of the sum of the features from one, at which they are taken to sum to one."""
+"""Largest spread of a feature, in units of its rounding, that is taken for rounding."""
+_SUM_IS_ONE = 1e-5
+"""Largest distance from one of a sum of features that is taken to be one."""
+_LARGEST_ERROR = 1e-3
+"""Largest distance from one of the sum of features and `constant`."""
 _LARGEST_FEATURE = 1e30
 """Features up to this size, and the reciprocals of their sizes, are normal numbers in float32."""
 
 
 class Basis(NamedTuple):
-    """Coordinates of p features x: the constant u nearest to one, and the slopes z about it.
+    """Coordinates of p features x: a constant, and the slopes `z = (x - middle) / unit` about it.
 
-    With everything in the units of the features, `u = level + constant' (x - middle)` and
-    `z = x - u middle`. They are 1 + p coordinates of p features: the slopes do not change along `constant`.
+    They are 1 + p coordinates of p features: z does not change along `constant`.
     """
 
     unit: Float[Array, " p"]
     """The scale of each feature."""
     middle: Float[Array, " p"]
-    """Mean features; zero where the features cannot express a constant, which leaves them as they are."""
+    """Mean features; zero if the features cannot express a constant."""
     constant: Float[Array, " p"]
-    """Coefficients of u, in units of the features."""
+    """Coefficients of the constant, in units of the features; zero if they cannot express one."""
     level: Scalar
-    """Mean of u: one, or zero where the features cannot express a constant."""
+    """The constant: one, or zero if the features cannot express one."""
 
 
 class Regression(NamedTuple):
-    """Hold a regression of the change of theta from the mean of a start, in units of `size`.
+    """A regression of the change of theta from the mean of a start, in units of `size`.
 
-    Rows and rest bear the roots of the weights, so that sums of their squares are weighted.
+    Rows and rest are multiplied by the roots of the weights: sums of their squares are weighted sums.
     """
 
     basis: Basis
@@ -63,13 +57,13 @@ class Regression(NamedTuple):
     size: Float[Array, " d"]
     """The unit of each parameter."""
     centre: Float[Array, " d"]
-    """The multiple of u that has been subtracted in `rest`."""
+    """The constant that has been subtracted in `rest`."""
     rest: Float[Array, "n d"]
-    """What is left of theta without the start and the centre."""
+    """Theta less the mean of the start and the centre."""
     solution: Float[Array, "q d"]
     """The regression of `rest`, in coordinates."""
     root: Float[Array, "q q"]
-    """The root, upper triangular, of what holds the solution: of `X' D X` and the ridge."""
+    """The root, upper triangular, of `X' D X` and the ridge."""
     normaliser: Scalar
     """Expected scatter of the residuals, for a variance of one."""
 
@@ -83,36 +77,36 @@ def regress(
     ridge: ScalarLike,
     scale: Float[Array, " p"] | None = None,
     start: Float[Array, "p d"] | None = None,
+    constant: Float[Array, " p"] | None = None,
 ) -> Regression:
     """Regress theta on features; for the arguments and errors see `fit_weighted_ml`.
 
     Source: Abdolmaleki et al. 2016, Eq. 14.
     """
-    features, theta, weights = _checked(features, theta, weights, ridge, scale, start)
+    features, theta, weights = _checked(features, theta, weights, ridge, scale, start, constant)
     weights = normalised(weights)
-    basis, size = _basis(features, weights, scale), _size(theta)
+    basis, size = _basis(features, weights, scale, constant), _size(theta)
     rows = coordinates(basis, features)
-    root = safe_sqrt(weights)[:, None]
 
     # What the constant and the start leave of theta. The constant of the start only moves the centre.
     offset = basis.level * exact_dot(weights, theta)
-    wobble = rows[:, :1] - basis.level
-    rest = ((theta - offset[None, :]) - wobble * offset[None, :]) / size[None, :]
-    centre = offset / size
+    rest, centre = (theta - offset[None, :]) / size[None, :], offset / size
     if start is not None:
         start = start * _ratio(basis.unit[:, None], size[None, :])
-        rest = rest - exact_dot(rows, jnp.pad(start, ((1, 0), (0, 0))))
+        rest = rest - exact_dot(rows[:, 1:], start)
         centre = centre - exact_dot(basis.middle / basis.unit, start)
-    rows, rest = root * rows, root * rest
 
-    # (X' D X + ridge P' P) B = X' D Y, by an orthogonal factorisation Q R of the root of the left side.
+    # With the ridge, (Phi' D Phi + P' P) A = Phi' D U. By the factorisation Q R of D^1/2 Phi above P, the
+    # matrix on the left is R' R, and A = R^-1 Q' D^1/2 U.
+    root = safe_sqrt(weights)[:, None]
+    rows, rest = root * rows, root * rest
     penalty = _penalty(basis, rows, jnp.sqrt(jnp.asarray(ridge, theta.dtype)))
     orthogonal, triangular = jnp.linalg.qr(jnp.concatenate([rows, penalty]))
     orthogonal, of_penalty = orthogonal[: len(rows)], orthogonal[len(rows) :]
     # In print: A = (Phi' D Phi)^-1 Phi' D U
     solution = jax.scipy.linalg.solve_triangular(triangular, exact_dot(orthogonal.T, rest))  # Eq. 14
     # The residuals are (I - Q Q') Y. Their expected scatter is 1 - sum d h with the leverages h = |Q_i|^2,
-    # but for what the ridge adds: with it, Q' Q = I - T' T for the rows T of Q that belong to the penalty.
+    # plus what the ridge adds: with it, Q' Q = I - T' T for the rows T of Q that belong to the penalty.
     counted = exact_dot(orthogonal.T, weights[:, None] * orthogonal)
     used = jnp.trace(counted) + jnp.sum(exact_dot(of_penalty, counted) * of_penalty)
     Z = normaliser(used, rows.shape[1])
@@ -121,10 +115,8 @@ def regress(
 
 def coordinates(basis: Basis, features: Float[Array, "n p"]) -> Float[Array, "n q"]:
     """Return the coordinates of features: the constant, and the slopes about it."""
-    centred = (features - basis.middle[None, :]) / basis.unit[None, :]
-    wobble = exact_dot(centred, basis.constant)[:, None]
-    slopes = centred - wobble * (basis.middle / basis.unit)[None, :]
-    return jnp.concatenate([basis.level + wobble, slopes], axis=1)
+    slopes = (features - basis.middle[None, :]) / basis.unit[None, :]
+    return jnp.pad(slopes, ((0, 0), (1, 0)), constant_values=basis.level)
 
 
 def as_coefficients(
@@ -136,13 +128,6 @@ def as_coefficients(
     coef = slopes + basis.constant[:, None] * intercept[None, :]
     largest = jnp.finfo(coef.dtype).max
     return jnp.clip(coef * _ratio(size[None, :], basis.unit[:, None]), -largest, largest)
-
-
-def _gauge(basis: Basis) -> Float[Array, "p p"]:
-    """Return the projection of slopes on the constant, along which they change nothing."""
-    size = safe_norm(basis.constant)
-    direction = basis.constant / jnp.where(size > 0, size, 1.0)
-    return direction[:, None] * direction[None, :]
 
 
 def normaliser(used: Scalar, num_coordinates: int) -> Scalar:
@@ -157,16 +142,26 @@ def normaliser(used: Scalar, num_coordinates: int) -> Scalar:
 
 
 def _checked(
-    features: Array, theta: Array, weights: Array, ridge: ScalarLike, scale: Array | None, start: Array | None
+    features: Array,
+    theta: Array,
+    weights: Array,
+    ridge: ScalarLike,
+    scale: Array | None,
+    start: Array | None,
+    constant: Array | None,
 ) -> tuple[Array, Array, Array]:
-    """Return the samples after checking all arguments; what has no weight is zero."""
+    """Return the samples after checking all arguments; rows without weight are zero."""
     checks.finite("weights", weights, least=0.0)
     checks.number("ridge", ridge, least=0.0)
     if scale is not None:
         checks.finite("scale", scale, above=0.0)
-    if start is not None:
-        checks.finite("start", start)
+    for name, given in (("start", start), ("constant", constant)):
+        if given is not None:
+            checks.finite(name, given)
     is_weighted = weights > 0
+    if constant is not None:
+        short = jnp.where(is_weighted, exact_dot(features, constant) - 1.0, 0.0)
+        checks.finite("features @ constant - 1", short, largest=_LARGEST_ERROR)
     features = jnp.where(is_weighted[:, None], features, 0.0)
     theta = jnp.where(is_weighted[:, None], theta, 0.0)
     checks.finite("features", features, largest=_LARGEST_FEATURE)
@@ -175,63 +170,58 @@ def _checked(
 
 
 def _size(columns: Float[Array, "n m"]) -> Float[Array, " m"]:
-    """Return the largest entry of each column, one for zeros. As a unit it cancels: it needs no gradient."""
+    """Return the size of the largest entry of each column, one for zeros; a unit cancels: no gradient."""
     size = lax.stop_gradient(jnp.max(jnp.abs(columns), axis=0))
     return jnp.where(size > 0, size, 1.0)
 
 
 def _ratio(top: Array, bottom: Array) -> Array:
-    """Divide positive units; what is too large for the format stays finite."""
+    """Divide positive units; a ratio beyond the format becomes its largest number."""
     return jnp.minimum(top / bottom, jnp.finfo(top.dtype).max)
 
 
-def _middle(features: Array, weights: Array) -> Array:
-    """Return the mean of each feature, which of one that is constant is that constant, without rounding."""
+def _steady(features: Array, weights: Array) -> tuple[Array, Array]:
+    """Return the largest value of each feature over the weighted samples, and whether all have this value."""
     counts = (weights > 0)[:, None]
     top = jnp.max(jnp.where(counts, features, -jnp.inf), axis=0)
     bottom = jnp.min(jnp.where(counts, features, jnp.inf), axis=0)
-    return jnp.where(top == bottom, lax.stop_gradient(top), weighted_mean(features, weights))
+    return lax.stop_gradient(top), top == bottom
 
 
-def _basis(features: Array, weights: Array, scale: Array | None) -> Basis:
+def _basis(features: Array, weights: Array, scale: Array | None, constant: Array | None) -> Basis:
     size = _size(features)
-    middle = _middle(features, weights)
-    centred = (features - middle[None, :]) / size[None, :]
-    spread = safe_sqrt(exact_dot(weights, centred**2))
-    rounding = jnp.asarray(_ROUNDING * jnp.finfo(features.dtype).eps, features.dtype)
+    value, is_steady = _steady(features, weights)
+    # The mean of a feature that does not vary is its value, without rounding.
+    middle = jnp.where(is_steady, value, weighted_mean(features, weights))
     if scale is None:
-        unit = size * jnp.where(spread > rounding, spread, 1.0)
+        spread = safe_sqrt(exact_dot(weights, ((features - middle[None, :]) / size[None, :]) ** 2))
+        unit = size * jnp.where(spread > _ROUNDING * jnp.finfo(features.dtype).eps, spread, 1.0)
     else:
         unit = jnp.clip(scale, jnp.maximum(1e-9 * size, 1e-37), jnp.minimum(1e9 * size, 1e37))
-    # Of features that sum to one the constant is that sum, wherever the samples are.
-    each = jnp.ones_like(unit) if scale is None else scale
-    short = jnp.where(weights > 0, 1.0 - jnp.sum(features / each[None, :], axis=1), 0.0)
-
-    def nearest_constant() -> Array:
-        # Made of the steadiest features.
-        steadiness = lax.stop_gradient(jnp.maximum(spread, rounding))
-        ones = jnp.ones((features.shape[0], 1), features.dtype)
-        constant = weighted_ridge(features / size[None, :], ones, weights, ridge=0.0, scale=steadiness)
-        return constant[:, 0] * unit / size
-
-    is_sum = jnp.all(jnp.abs(short) < _SUM_IS_ONE)
-    constant = lax.cond(is_sum, lambda: unit / each, nearest_constant)
-
-    share = exact_dot(middle / unit, constant)
-    has_constant = share > 0.5
-    constant = constant / jnp.where(has_constant, share, jnp.maximum(safe_norm(constant), 1e-30))
-    middle = jnp.where(has_constant, middle, 0.0)
-    return Basis(unit, middle, constant, has_constant.astype(features.dtype))
+    if constant is None:
+        total = jnp.sum(features, axis=1)
+        is_sum = jnp.all((jnp.abs(total - 1.0) < _SUM_IS_ONE) | (weights == 0))
+        is_single = is_steady & (value != 0)
+        is_first = is_single & (jnp.cumsum(is_single) == 1)
+        single = jnp.where(is_first, unit / jnp.where(is_first, value, 1.0), 0.0)
+        constant = jnp.where(is_sum, unit, single)
+    else:
+        constant = constant * unit
+    level = jnp.any(constant != 0).astype(features.dtype)
+    return Basis(unit, level * middle, constant, level)
 
 
 def _penalty(basis: Basis, rows: Float[Array, "n q"], damping: Scalar) -> Float[Array, "q q"]:
-    """Return the root of the penalty on coordinates: of the slopes, except along the constant.
+    """Return the root of the penalty on coordinates: on the slopes, except along the constant.
 
-    What is added to it is the resolution of the format, and what the slopes have along the constant: it
-    changes nothing, and is held at zero.
+    Slopes along the constant change nothing: they are held at zero. A penalty of the resolution of the format
+    is added for all.
     """
     num = rows.shape[1]
-    along, identity = _gauge(basis), jnp.eye(num - 1, dtype=rows.dtype)
+    identity = jnp.eye(num - 1, dtype=rows.dtype)
+    norm = safe_norm(basis.constant)
+    direction = basis.constant / jnp.where(norm > 0, norm, 1.0)
+    along = direction[:, None] * direction[None, :]
     least = 4.0 * num**0.5 * jnp.finfo(rows.dtype).eps
     size = lax.stop_gradient(jnp.maximum(safe_sqrt(jnp.sum(rows**2, axis=0)), 1.0))
     slopes = jnp.pad(damping * (identity - along) + along, ((1, 0), (1, 0)))

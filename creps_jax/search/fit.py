@@ -39,8 +39,10 @@ def weighted_ml(
     scale: Float[Array, " p"] | None = None,
 ) -> LinearGaussian:
     """Fit by weighted maximum likelihood, wherever that leads: `fit_weighted_ml` from the old policy on."""
-    features, theta, weights, _ = samples
-    return fit_weighted_ml(features, theta, weights, ridge=ridge, scale=scale, start=policy.coef)
+    features, theta, weights, _, constant = samples
+    return fit_weighted_ml(
+        features, theta, weights, ridge=ridge, scale=scale, start=policy.coef, constant=constant
+    )
 
 
 @checks.arguments
@@ -124,8 +126,10 @@ class BoundedML:
         """Fit within the bounds; see `fit_weighted_ml` for the settings."""
         checks.instance("policy", policy, LinearGaussian)
         checks.instance("samples", samples, WeightedSamples)
-        features, theta, weights, _ = samples
-        fit = regress(features, theta, weights, ridge=ridge, scale=scale, start=policy.coef)
+        features, theta, weights, _, constant = samples
+        fit = regress(
+            features, theta, weights, ridge=ridge, scale=scale, start=policy.coef, constant=constant
+        )
         old_chol = policy.cov_chol / fit.size[:, None]
         change, unbiased = _bounded_change(fit, old_chol, samples, self.mean_kl_bound)
         residual = fit.rest - exact_dot(fit.rows, change.at[0].add(-fit.centre))

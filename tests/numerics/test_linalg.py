@@ -13,7 +13,6 @@ from creps_jax.numerics.linalg import (
     safe_sqrt,
     thomas_solve,
     weighted_mean,
-    weighted_ridge,
     whitened_regression,
 )
 
@@ -72,61 +71,6 @@ def test_thomas_has_gradients():
 def test_thomas_names_bad_shapes():
     with pytest.raises(ValueError, match=r"rhs must have shape \(4,\) beside lower \(4,\) .*, got \(3,\)"):
         thomas_solve(jnp.ones(4), jnp.ones(4), jnp.ones(4), jnp.ones(3))
-
-
-# Regression.
-
-
-def test_weighted_ridge_solves_the_normal_equations():
-    rng = np.random.default_rng(3)
-    features, targets = rng.normal(size=(50, 4)) * [1e-3, 1.0, 30.0, 1e4], rng.normal(size=(50, 2))
-    weights = rng.exponential(size=50)
-    for ridge in (0.0, 0.1, 10.0):
-        found = weighted_ridge(*map(jnp.float32, (features, targets, weights)), ridge=ridge)
-        share = weights / weights.sum()
-        gram = features.T @ (share[:, None] * features)
-        penalty = ridge * np.diag(np.diag(gram))
-        expected = np.linalg.solve(gram + penalty, features.T @ (share[:, None] * targets))
-        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=1e-5 * np.abs(expected).max())
-
-
-def test_weighted_ridge_bears_features_on_a_large_offset():
-    rng = np.random.default_rng(4)
-    context = 1000.0 + rng.uniform(size=200)
-    features = np.column_stack([np.ones(200), context]).astype(np.float32)
-    targets = (3.0 * (features[:, 1].astype(float) - 1000.0))[:, None]
-    found = weighted_ridge(jnp.asarray(features), jnp.float32(targets), jnp.ones(200), ridge=0.0)
-    np.testing.assert_allclose(np.float64(features) @ np.float64(found), targets, atol=5e-3)
-
-
-def test_weighted_ridge_ignores_samples_without_weight():
-    rng = np.random.default_rng(5)
-    features, targets = jnp.float32(rng.normal(size=(20, 3))), jnp.float32(rng.normal(size=(20, 2)))
-    weights = jnp.where(jnp.arange(20) < 10, 1.0, 0.0)
-    expected = weighted_ridge(features[:10], targets[:10], weights[:10], ridge=0.01)
-    hidden = weights[:, None] == 0
-    found = weighted_ridge(
-        jnp.where(hidden, jnp.nan, features), jnp.where(hidden, jnp.inf, targets), weights, ridge=0.01
-    )
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
-
-
-def test_weighted_ridge_holds_a_feature_that_could_be_large_but_is_not():
-    features = jnp.ones((50, 2)).at[:, 1].set(jnp.linspace(0.0, 1e-4, 50))
-    targets = features[:, 1:] * 1e4
-    wild = weighted_ridge(features, targets, jnp.ones(50), ridge=1e-4)
-    held = weighted_ridge(features, targets, jnp.ones(50), ridge=1e-4, scale=jnp.ones(2))
-    assert wild[1, 0] > 5e3 and jnp.abs(held[1, 0]) < 1.0
-
-
-@pytest.mark.parametrize("num_weighted", [0, 1, 2])
-def test_weighted_ridge_on_fewer_samples_than_features_fits_them(num_weighted):
-    rng = np.random.default_rng(6)
-    features, targets = jnp.float32(rng.normal(size=(20, 5))), jnp.float32(rng.normal(size=(20, 2)))
-    weights = jnp.where(jnp.arange(20) < num_weighted, 1.0, 0.0)
-    found = weighted_ridge(features, targets, weights, ridge=0.0)
-    assert np.all(np.isfinite(found))
-    np.testing.assert_allclose((features @ found)[:num_weighted], targets[:num_weighted], atol=1e-3)
 
 
 # Weights, means and roots.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
+from creps_jax.policies.base import WeightedSamples
 from creps_jax.policies.features import (
     linear_features,
     polynomial_features,
@@ -17,11 +18,13 @@ from creps_jax.policies.gaussian import (
     entropy,
     fit_weighted_ml,
     kl,
+    linear_gaussian,
     log_prob,
     mean,
     sample,
     start_policy,
 )
+from creps_jax.search.fit import weighted_ml
 
 COEF = np.array([[1.0, -2.0, 0.5], [3.0, 0.0, -1.0]])
 ROOT = np.array([[0.5, 0.0, 0.0], [0.2, 1.0, 0.0], [-0.3, 0.4, 2.0]])
@@ -187,10 +190,11 @@ def polynomial(num=100, degree=3):
     return context[:, None] ** np.arange(degree + 1), theta, rng.exponential(size=num), start
 
 
-def fitted(features, theta, weights, start=None, scale=None, ridge=1e-3):
+def fitted(features, theta, weights, start=None, scale=None, ridge=1e-3, constant=None):
     """Return the mean at the samples, in float64, and the factor of the covariance."""
-    arrays = [None if x is None else jnp.float32(x) for x in (features, theta, weights, scale, start)]
-    found = fit(*arrays[:3], ridge=ridge, scale=arrays[3], start=arrays[4])
+    features, theta, weights = map(jnp.float32, (features, theta, weights))
+    scale, start, constant = (None if x is None else jnp.float32(x) for x in (scale, start, constant))
+    found = fit(features, theta, weights, ridge=ridge, scale=scale, start=start, constant=constant)
     return np.float64(np.float32(features)) @ np.float64(found.coef), np.float64(found.cov_chol)
 
 
@@ -232,9 +236,10 @@ def test_the_zero_of_a_feature_does_not_matter(constant, zero):
     features, theta, weights, _ = polynomial()
     kind = np.arange(len(features)) % 3 == 0
     ones = np.ones((len(features), 1)) if constant == "one" else np.column_stack([kind, ~kind])
+    stated = np.append(np.ones(ones.shape[1]), 0.0)
     context = np.float64(np.float32(features[:, 1:2] + zero))
-    found = fitted(np.column_stack([ones, context]), theta, weights)
-    expected = fitted(np.column_stack([ones, context - zero]), theta, weights)
+    found = fitted(np.column_stack([ones, context]), theta, weights, constant=stated)
+    expected = fitted(np.column_stack([ones, context - zero]), theta, weights, constant=stated)
     # Coefficients of this size cannot hold the mean better.
     np.testing.assert_allclose(found[0], expected[0], atol=8 * zero * np.finfo(np.float32).eps)
     np.testing.assert_allclose(found[1], expected[1], atol=1e-4)
@@ -282,6 +287,41 @@ def test_the_size_of_the_weights_does_not_matter(function, largest):
     found = function(features, theta, share * jnp.float32(largest), ridge=1e-3)
     np.testing.assert_allclose(features @ found.coef, features @ expected.coef, atol=1e-4)
     np.testing.assert_allclose(found.cov_chol, expected.cov_chol, atol=1e-5)
+
+
+@pytest.mark.parametrize("has_scale", [False, True], ids=["no scale", "scale"])
+@pytest.mark.parametrize("num", [4, 12, 100])
+@pytest.mark.parametrize(
+    "features", [linear_features(2), polynomial_features(2, 2), rbf_features([0, 0], [1, 1], 3)]
+)
+def test_the_constant_that_features_state_is_found_in_samples_too(features, num, has_scale):
+    rng = np.random.default_rng(num)
+    rows = features(jnp.float32(rng.uniform(size=(num, 2))))
+    theta, weights = rng.normal(size=(num, 2)) + np.array([0.0, 100.0]), rng.exponential(size=num)
+    scale = np.ones(features.size) if has_scale else None
+    found = fitted(rows, theta, weights, scale=scale)
+    stated = fitted(rows, theta, weights, scale=scale, constant=features.constant)
+    np.testing.assert_allclose(found[0], stated[0], rtol=1e-6)
+    np.testing.assert_allclose(found[1], stated[1], rtol=1e-6)
+
+
+@pytest.mark.parametrize("seen", [0.0, 0.3])
+def test_a_policy_of_one_context_does_not_extrapolate(seen):
+    """At one context all features are constant: only `FeatureMap.constant` tells which one always is."""
+    features = linear_features(1)
+    theta = jnp.float32(np.random.default_rng(0).normal(size=(10, 2)) + 5.0)
+    kind = linear_gaussian(features, m_step=weighted_ml)
+    start = start_policy(features, 2)
+    rows = features(jnp.full((10, 1), seen))
+    fitted = kind.fit(start, WeightedSamples(rows, theta, jnp.full(10, 0.1), jnp.ones(10, bool)))
+    np.testing.assert_allclose(fitted.coef[0], theta.mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(fitted.coef[1], 0.0, atol=1e-5)
+
+
+def test_a_constant_that_the_features_do_not_make_is_refused():
+    features, theta, weights, _ = (jnp.float32(x) for x in polynomial(degree=1))
+    with pytest.raises(ValueError, match=r"features @ constant - 1 must be at most 0\.001 in size, got 1\.0"):
+        fit_weighted_ml(features, theta, weights, ridge=0.0, constant=jnp.array([2.0, 0.0]))
 
 
 def test_features_and_parameters_beyond_their_limits_are_named():
