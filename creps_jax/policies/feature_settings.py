@@ -21,20 +21,23 @@ class Features:
 
     Attributes:
         kind: One of `FEATURE_KINDS`.
-        num_centers: K along each context variable, for RBFs; None is 5 for one variable, 3 for two, and 2 for
-            more.
+        num_centers: Number K of RBF centres: one for all context variables, or one for each; None is 5 for
+            one variable, 3 along each of two, and 2 along each of more.
         bandwidth: Width of the RBFs in the units of the context; None is (high - low) / K.
     """
 
     kind: str = "rbf"
-    num_centers: int | None = None
+    num_centers: int | tuple[int, ...] | None = None
     bandwidth: float | None = None
 
+    def __post_init__(self) -> None:
+        # Settings are hashed.
+        if isinstance(self.num_centers, list):
+            object.__setattr__(self, "num_centers", tuple(self.num_centers))
+
     def complete(self, dim: int) -> "Features":
-        """Return the settings for a number of context variables, with what None stands for."""
-        if self.num_centers is not None:
-            return self
-        return dataclasses.replace(self, num_centers={1: 5, 2: 3}.get(dim, 2))
+        """Return the settings for a number of context variables, with the default number of centres."""
+        return dataclasses.replace(self, num_centers=self._centers(dim))
 
     def make(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
         """Return the features over a range of contexts: a number, or one for each context variable.
@@ -48,8 +51,7 @@ class Features:
         if self.kind == "linear":
             return linear_features(np.size(low))
         if self.kind == "rbf":
-            num_centers = self.complete(np.size(low)).num_centers
-            return rbf_features(low, high, num_centers or 0, bandwidth=self.bandwidth)
+            return rbf_features(low, high, self._centers(np.size(low)), bandwidth=self.bandwidth)
         raise ValueError(f"features must be one of {', '.join(FEATURE_KINDS)}, got {self.kind!r}")
 
     def make_baseline(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
@@ -62,3 +64,6 @@ class Features:
 
         features = self.make(low, high)
         return quadratic_features(features.context_dim) if self.kind == "linear" else features
+
+    def _centers(self, dim: int) -> int | tuple[int, ...]:
+        return {1: 5, 2: 3}.get(dim, 2) if self.num_centers is None else self.num_centers

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import json
 import shutil
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from creps_jax.tools import play, results, tables
 from creps_jax.tools.cli import main as tools
 from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy
 from creps_jax.tools.robots import WALKERS
+from creps_jax.tools.session.plain import read
 from creps_jax.tools.video import Clip, VideoError
 from creps_jax.training import evaluate
 from creps_jax.walking.params import (
@@ -31,7 +33,7 @@ from creps_jax.walking.params import (
     PARAM_NAMES,
 )
 from creps_jax.walking.posture import Balance
-from experiments import fig11_walk, runner, walk
+from experiments import fig11_walk, runner, walk, walk_slope
 from experiments.cli import main
 
 SHIPPED = shipped_policy()
@@ -212,6 +214,23 @@ def test_settings_within_settings_are_options(bench):
     assert main(["run", "walk", *options, "--out", "seven"]) == 0
     kept = results.load_manifest(Path("seven"))["settings"]
     assert (kept["features"]["num_centers"], kept["kl_bound"]) == (7, 1.0)
+
+
+@pytest.mark.parametrize("num_centers", [None, 4, (4, 3)])
+def test_the_numbers_of_centres_come_back_from_a_manifest(num_centers):
+    settings = walk_slope.Settings(features=walk.Features("rbf", num_centers))
+    assert walk_slope.Settings(**dataclasses.asdict(settings)) == settings
+    manifest = json.loads(json.dumps(dataclasses.asdict(settings)))
+    assert read(walk_slope.Settings, manifest, "settings") == settings
+    features = settings.features.make(*settings.context_range())
+    assert features.size == {None: 9, 4: 16, (4, 3): 12}[num_centers]
+
+
+def test_each_context_can_have_its_own_number_of_centres_on_the_command_line(capsys):
+    options = ["--features.num-centers", "5", "3", "2", "--out", "three"]
+    assert main(["run", "walk_slope", *options]) == 2
+    wanted = r"num_centers must be one number or 2, one for each axis, got (5, 3, 2)"
+    assert wanted in capsys.readouterr().err
 
 
 def test_a_run_can_go_on_from_a_policy(tmp_path):

@@ -429,6 +429,12 @@ def broken(*path, **values) -> dict:
         (broken("features", num_centers=0), "num_centers must be at least 1, got 0"),
         (broken("features", num_centers=2.5), r"features\.num_centers must be a whole number, got 2\.5"),
         (
+            broken("features", num_centers=[2.5]),
+            r"features\.num_centers\[0\] must be a whole number, got 2\.5",
+        ),
+        (broken("features", num_centers=[5, 3]), r"num_centers must be one number or 1, .*, got \(5, 3\)"),
+        (broken("features", num_centers=[0]), r"num_centers must be whole numbers of at least 1, got \(0,\)"),
+        (
             broken(features=3),
             "features must be an object with the fields kind, num_centers, bandwidth, got 3",
         ),
@@ -603,6 +609,25 @@ def test_the_page_warns_of_a_search_that_goes_by_chance(session, changes, warnin
     assert len(found) == len(warnings)
     for line, warning in zip(found, warnings, strict=True):
         assert line.startswith(warning)
+
+
+def test_each_context_may_have_its_own_number_of_centres(tmp_path):
+    contexts = [{"name": f"c{i}", "low": 0.0, "high": 1.0} for i in range(2)]
+    features = {"kind": "rbf", "num_centers": [4, 2]}
+    define = {
+        "contexts": contexts,
+        "parameters": [{"name": "x", "low": -5.0, "high": 5.0}],
+        "features": features,
+    }
+    session = RobotSession.create(tmp_path / "arm", define=define)
+    assert RobotSession.open(tmp_path / "arm").settings == session.settings
+    assert session.settings.features.num_centers == (4, 2)
+    session.policy().save(tmp_path / "policy.npz")
+    policy = load(tmp_path / "policy.npz")
+    assert policy.features == rbf_features((0.0, 0.0), (1.0, 1.0), (4, 2))
+    again = RobotSession.create(tmp_path / "again", policy=policy)
+    assert again.settings.features == session.settings.features
+    assert again.policy().features == policy.features
 
 
 @pytest.mark.parametrize(

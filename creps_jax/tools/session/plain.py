@@ -22,8 +22,8 @@ def read(kind: type[T], values: Any, name: object) -> T:
     """Make a dataclass of plain values, as JSON has them.
 
     Args:
-        kind: a dataclass whose fields are numbers, text, tuples, dicts, other such dataclasses, or one of
-            these or None.
+        kind: a dataclass whose fields are numbers, text, tuples, dicts or other such dataclasses, or unions
+            of one of these with a tuple or None.
         values: a dict of its fields.
         name: where they come from, for errors.
 
@@ -81,7 +81,12 @@ def _join(place: str, name: str) -> str:
 def _value(kind: Any, value: Any, place: str) -> Any:
     container, elements = typing.get_origin(kind), typing.get_args(kind)
     if container is types.UnionType:
-        return None if value is None else _value(elements[0], value, place)
+        if value is None:
+            return None
+        is_list = isinstance(value, list | tuple)
+        kinds = [each for each in elements if each is not types.NoneType]
+        fitting = [each for each in kinds if (typing.get_origin(each) is tuple) == is_list]
+        return _value((fitting or kinds)[0], value, place)
     if dataclasses.is_dataclass(kind):
         return _read(kind, value, place)  # type: ignore[arg-type]
     if container is tuple:

@@ -53,13 +53,14 @@ def _settings_of_features(learned: Learned) -> Features:
     settings = Features("linear")
     if described["kind"] == "rbf":
         counts, widths = described["num_centers"], described["width"]
-        settings = Features("rbf", counts[0])
+        num_centers = counts[0] if len(set(counts)) == 1 else tuple(counts)
+        settings = Features("rbf", num_centers)
         if settings.make(low, high) != learned.features:
-            settings = Features("rbf", counts[0], widths[0])
+            settings = Features("rbf", num_centers, widths[0])
     if settings.make(low, high) != learned.features:
         raise UserError(
             "a session must begin with linear features, or with RBFs over the range of the contexts that "
-            f"have one number of centres and one width, got {described}"
+            f"have the default width or one width, got {described}"
         )
     return settings
 
