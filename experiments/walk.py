@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from creps_jax import files
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.errors import UserError
+from creps_jax.policies.bounds import CLIP, PENALTY, SIGMOID
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.policies.learned import Learned
@@ -54,8 +55,8 @@ BOUNDS = {
     "paper": PAPER_BOUNDS,
 }
 SAMPLERS = {"gaussian": partial(gaussian_contexts, clip=True), "uniform": uniform_contexts}
-CONSTRAINTS = ("sigmoid", "penalty")
-PENALTY = 1000.0
+CONSTRAINTS = (SIGMOID, PENALTY)
+PENALTY_SIZE = 1000.0
 NUM_SPEEDS = 11
 TIMESTEP = 0.004
 
@@ -131,7 +132,7 @@ class Settings:
     significance: float | None = None
     features: Features = Features("rbf", 5)
     bounds: str | None = None
-    constraint: str = "sigmoid"
+    constraint: str = SIGMOID
     start_mean: float = 0.0
     start_std: float = 1.0
     start_policy: str | None = None
@@ -247,7 +248,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         (trials, n, d), the evaluation (trials, n, seeds), and, of several trials, `trial_reward` (trials,):
         the mean over the same speeds in the noise of learning, by which the policy that is kept is chosen.
     """
-    if settings.constraint != "sigmoid":
+    if settings.constraint != SIGMOID:
         raise UserError(f"a policy is only kept with the constraint sigmoid, got {settings.constraint!r}")
     evaluate_key, learn_key = jax.random.split(key)
     states, log = learn_to_walk(settings, learn_key, session=session, name="walk")
@@ -355,8 +356,8 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
         conditions=settings.conditions(),
         robot=settings.walker().robot,
     )
-    if settings.constraint == "penalty":
-        return penalised(task, *settings.box(), PENALTY)
+    if settings.constraint == PENALTY:
+        return penalised(task, *settings.box(), PENALTY_SIZE)
     return sigmoid_constrained(task, *settings.box())
 
 
@@ -391,7 +392,7 @@ def first_policy(settings: Settings) -> LinearGaussian:
         jnp.full(len(PARAM_NAMES), settings.start_mean),
         jnp.full(len(PARAM_NAMES), settings.start_std),
     )
-    if settings.constraint == "penalty":
+    if settings.constraint == PENALTY:
         low, high = (jnp.asarray(bound) for bound in settings.box())
         mean, slope = jax.jvp(lambda free: sigmoid_gate(free, low, high), (mean,), (jnp.ones_like(mean),))
         std = slope * std
@@ -412,7 +413,7 @@ def evaluate_trials(
 def parameter_space(settings: Settings) -> Space:
     """Return the walking parameters with their bounds."""
     low, high = settings.box()
-    constraint = "sigmoid" if settings.constraint == "sigmoid" else "clip"
+    constraint = SIGMOID if settings.constraint == SIGMOID else CLIP
     return Space(PARAM_NAMES, low, high, PARAM_UNITS, constraint)
 
 

@@ -15,6 +15,7 @@ from creps_jax.errors import UserError
 from creps_jax.files import load_arrays, save_arrays
 from creps_jax.policies import features as feature_maps
 from creps_jax.policies import gaussian
+from creps_jax.policies.bounds import CLIP, PENALTY
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.gaussian import LinearGaussian
@@ -26,7 +27,7 @@ __all__ = ["Learned", "load", "save"]
 FORMAT = "creps_jax policy"
 VERSION = 3
 _READABLE = ("2", "3")
-_CLIP_BEFORE = "penalty"
+_CLIP_BEFORE = PENALTY
 """What files of version 2 call the constraint `clip`."""
 
 
@@ -191,11 +192,11 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
         context_low, context_high = arrays["context_range"].tolist()
         param_low, param_high = arrays["param_bounds"].tolist()
         constraint = str(arrays["constraint"])
-        constraint = "clip" if constraint == _CLIP_BEFORE else constraint
+        constraint = CLIP if constraint == _CLIP_BEFORE else constraint
         return Learned(
             LinearGaussian(jnp.asarray(arrays["coef"]), jnp.asarray(arrays["cov_chol"])),
             _features(json.loads(str(arrays["features"])), (context_low, context_high), features),
-            _space(arrays, "context", context_low, context_high, "clip"),
+            _space(arrays, "context", context_low, context_high, CLIP),
             _space(arrays, "param", param_low, param_high, constraint),
             json.loads(str(arrays["task"])),
         )

@@ -12,13 +12,10 @@ from jax.core import Tracer
 
 from creps_jax import checks
 from creps_jax.errors import UserError
+from creps_jax.policies.bounds import CLIP, SIGMOID, check_constraint, range_error
 from creps_jax.typing import Array, Float, ScalarLike, VectorLike
 
-__all__ = ["CONSTRAINTS", "Space", "penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
-
-CONSTRAINTS = ("sigmoid", "clip", "none")
-"""How numbers that a search draws freely become parameters inside their bounds: squashed by a sigmoid, cut
-off at the bounds, or not at all."""
+__all__ = ["Space", "penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
 
 _WIDE = 1e37
 """Width of a box from which it, or its inverse, can be out of the range of float32."""
@@ -33,9 +30,9 @@ class Space:
         low: Lower ends; minus infinity where there is none.
         high: Upper ends.
         units: Units, by default none.
-        constraint: Of parameters, how the numbers that a search draws are kept inside: "sigmoid" squashes
-            them, as `sigmoid_constrained` does in learning, "clip" cuts them off at the bounds, "none" leaves
-            them.
+        constraint: How the numbers that a search draws become parameters within their bounds: "sigmoid"
+            squashes them, as `sigmoid_constrained` does in learning, "clip" cuts them off at the bounds,
+            "none" leaves them.
 
     Raises:
         ValueError: If names are missing or equal, there is not one end and unit for each, an end is no
@@ -46,7 +43,7 @@ class Space:
     low: tuple[float | int, ...]
     high: tuple[float | int, ...]
     units: tuple[str, ...] = ()
-    constraint: str = "clip"
+    constraint: str = CLIP
 
     def __post_init__(self) -> None:
         """Check the fields, and turn sequences into tuples."""
@@ -68,9 +65,8 @@ class Space:
                 raise ValueError(f"low of {name} must not exceed its high, got {bottom:g} and {top:g}")
         object.__setattr__(self, "low", low)
         object.__setattr__(self, "high", high)
-        if self.constraint not in CONSTRAINTS:
-            raise ValueError(f"constraint must be one of {', '.join(CONSTRAINTS)}, got {self.constraint!r}")
-        if self.constraint == "sigmoid" and not all(abs(end) <= checks.FLOAT32_MAX for end in (*low, *high)):
+        check_constraint(self.constraint)
+        if self.constraint == SIGMOID and not all(abs(end) <= checks.FLOAT32_MAX for end in (*low, *high)):
             raise ValueError(f"low and high must be finite in float32 for a sigmoid, got {low} and {high}")
 
     @property
@@ -79,19 +75,34 @@ class Space:
         return len(self.names)
 
     def inside(self, free: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
-        """Turn numbers that a search draws freely into parameters inside the bounds.
+        """Turn free numbers, which a search draws, into parameters within the bounds.
+
+        Raises:
+            ValueError: If there is not a number for each variable along the last axis.
 
         Source: Abdolmaleki et al. 2016, Eq. 17, for a sigmoid.
         """
-        free = checks.array("free", free)
-        if free.shape[-1:] != (self.size,):
-            raise ValueError(f"free must have {self.size} numbers along its last axis, got {free.shape}")
-        if self.constraint == "sigmoid":
+        free = self._rows("free", free)
+        if self.constraint == SIGMOID:
             return sigmoid_gate(free, self.low, self.high)
-        if self.constraint == "clip":
-            low, high = (jnp.asarray(end, free.dtype) for end in (self.low, self.high))
+        if self.constraint == CLIP:
+            ends = (jnp.asarray(end, free.dtype) for end in (self.low, self.high))
+            low, high = (jnp.broadcast_to(end, free.shape) for end in ends)
             return jnp.clip(free, low, high)
         return free
+
+    def free(self, parameters: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
+        """Turn parameters into the free numbers that `inside` maps to them, to begin a search there.
+
+        `start_policy(features, space.size, mean=space.free(known))` has the mean `known` in every context.
+
+        Raises:
+            ValueError: If there is not a number for each variable along the last axis.
+        """
+        parameters = self._rows("parameters", parameters)
+        if self.constraint == SIGMOID:
+            return sigmoid_gate_inverse(parameters, self.low, self.high)
+        return parameters
 
     def numbers(self, values: Sequence[Any]) -> np.ndarray:
         """Return a number for each variable as an array (n,).
@@ -124,10 +135,7 @@ class Space:
         found = self._outside(numbers)
         if found is not None:
             low, high, unit = self.low[found], self.high[found], self.units[found]
-            raise UserError(
-                f"{self.names[found]} must be within its range, {low:g} to {high:g} {unit}, "
-                f"got {numbers[found]}".replace(" ,", ",")
-            )
+            raise range_error(self.names[found], numbers[found], low, high, unit)
         return numbers
 
     def _outside(self, numbers: np.ndarray) -> int | None:
@@ -137,6 +145,12 @@ class Space:
             if not (low - slack <= value <= high + slack and math.isfinite(value)):
                 return index
         return None
+
+    def _rows(self, name: str, numbers: Array) -> Array:
+        numbers = checks.array(name, numbers)
+        if numbers.shape[-1:] != (self.size,):
+            raise ValueError(f"{name} must have {self.size} numbers along the last axis, got {numbers.shape}")
+        return numbers
 
     def _ends(self, side: str, num: int) -> tuple[float, ...]:
         values = np.ravel(np.asarray(getattr(self, side), object)).tolist()

@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from creps_jax.policies.space import penalty, sigmoid_gate, sigmoid_gate_inverse, violation
+from creps_jax.policies.features import linear_features
+from creps_jax.policies.gaussian import start_policy
+from creps_jax.policies.space import Space, penalty, sigmoid_gate, sigmoid_gate_inverse, violation
 
 LOW, HIGH = (0.0, -5.0, 100.0), (0.01, 5.0, 101.0)
 numbers = st.floats(-1e6, 1e6, width=32)
@@ -38,6 +40,18 @@ def test_inverse_undoes_the_gate(fraction):
 def test_inverse_takes_what_lies_outside_to_the_bound():
     free = sigmoid_gate_inverse(jnp.asarray([-9.0, 9.0]), -1.0, 1.0)
     np.testing.assert_allclose(sigmoid_gate(free, -1.0, 1.0), [-1.0, 1.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("constraint", ["sigmoid", "clip", "none"])
+def test_a_search_can_begin_at_known_parameters(constraint):
+    space = Space(("length", "height", "time"), LOW, HIGH, constraint=constraint)
+    known = jnp.asarray([0.002, -4.0, 100.9])
+    features = linear_features(1)
+    start = start_policy(features, space.size, mean=space.free(known), std=0.1)
+    means = space.inside(features(jnp.asarray([[-1.0], [3.0]])) @ start.coef)
+    np.testing.assert_allclose(means, np.tile(known, (2, 1)), rtol=1e-5)
+    with pytest.raises(ValueError, match=r"parameters must have 3 numbers along the last axis, got \(2,\)"):
+        space.free(jnp.zeros(2))
 
 
 def test_equal_bounds_fix_a_parameter():

@@ -102,9 +102,9 @@ def test_contexts_are_drawn_or_given(session):
     ):
         session.ask([1.5])
     assert [trial.context["distance"] for trial in session.ask([1.5], more=2)] == [1.25, 1.5, 1.5]
-    with pytest.raises(UserError, match=r"distance must be within 0\.5 to 2 m, got 2\.5"):
+    with pytest.raises(UserError, match=r"distance must be within its range, 0\.5 to 2 m, got 2\.5"):
         session.ask([2.5], more=1)
-    with pytest.raises(UserError, match=r"a number for each of distance, got \(1, 2\)"):
+    with pytest.raises(UserError, match=r"context must be a number for each of distance, got \(1, 2\)"):
         session.ask([1, 2], more=1)
     with pytest.raises(UserError, match="more must be from 1 to 10000, got 0"):
         session.ask(more=0)

@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional, arg, subcommand
 
 from creps_jax.errors import UserError
+from creps_jax.policies.bounds import range_text
 from creps_jax.tools.session.robot_session import RobotSession
 from creps_jax.tools.session.settings import Context
 from creps_jax.tools.session.storage import TRIALS
@@ -160,7 +161,7 @@ def _new(command: New, say: Callable[[str], None]) -> None:
 
 
 def _list(variables: Sequence[Context]) -> str:
-    return ", ".join(f"{each.name} {each.low:g} to {each.high:g} {each.unit}".rstrip() for each in variables)
+    return ", ".join(f"{each.name} {range_text(each.low, each.high, each.unit)}" for each in variables)
 
 
 def _ask(command: Ask, say: Callable[[str], None]) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from creps_jax.contexts import context_grid
 from creps_jax.errors import UserError
 from creps_jax.policies import gaussian
+from creps_jax.policies.bounds import SIGMOID
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned
 from creps_jax.search.archive import Batch
@@ -175,7 +176,7 @@ def _programs(settings: Settings) -> _Programs:
         theta = algorithm.ask(key, state, context[None])[0]
         parameters = inside(theta)
         # What is cut off was never tried, and nothing is to be learned of it.
-        return (theta if settings.constraint == "sigmoid" else parameters), parameters
+        return (theta if settings.constraint == SIGMOID else parameters), parameters
 
     def distance(policy: LinearGaussian, reference: LinearGaussian) -> jax.Array:
         rows = jax.vmap(features.apply)(grid)

@@ -9,16 +9,18 @@ from typing import Any
 
 from creps_jax import files
 from creps_jax.errors import UserError
+from creps_jax.policies.bounds import CLIP, SIGMOID, check_constraint, range_error, range_text
 from creps_jax.policies.feature_settings import Features
 from creps_jax.tools.session import plain
 
-CONSTRAINTS = ("sigmoid", "clip")
+CONSTRAINTS = (SIGMOID, CLIP)
+"""How parameters are kept within their bounds: a robot needs all of them inside."""
 MAX_BATCH = 10_000
-"""So many trials are drawn, and written down, at once."""
+"""Largest number of trials that are drawn and written at once."""
 MAX_ARCHIVE = 1_000_000
-"""So many trials an update can hold in memory."""
+"""Largest number of trials that an update holds in memory."""
 MAX_CONTEXTS = 10
-"""Policies are compared on a grid of contexts, which has 2^10 points then."""
+"""Policies are compared on a grid of contexts, which then has 2^10 points."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -56,7 +58,7 @@ class Parameter(Context):
         if self.start is not None and not self.low <= self.start <= self.high:
             raise UserError(
                 f"start of {self.name} must be within its bounds, "
-                f"{f'{self.low:g} to {self.high:g} {self.unit}'.rstrip()}, got {self.start:g}"
+                f"{range_text(self.low, self.high, self.unit)}, got {self.start:g}"
             )
         if self.spread is not None and not self.spread > 0:
             raise UserError(f"spread of {self.name} must be above zero, got {self.spread:g}")
@@ -99,7 +101,7 @@ class Settings:
     contexts: tuple[Context, ...]
     parameters: tuple[Parameter, ...]
     features: Features = Features()
-    constraint: str = "sigmoid"
+    constraint: str = SIGMOID
     kl_bound: float = 0.5
     mean_kl_bound: float | None = 0.5
     cov_kl_bound: float | None = 0.05
@@ -115,11 +117,7 @@ class Settings:
         _check_numbers(self)
         for parameter in self.parameters:
             start = parameter.start
-            if (
-                start is not None
-                and self.constraint == "sigmoid"
-                and start in (parameter.low, parameter.high)
-            ):
+            if start is not None and self.constraint == SIGMOID and start in (parameter.low, parameter.high):
                 raise UserError(
                     f"start of {parameter.name} is at its bound, {start:g}, which a sigmoid never reaches"
                 )
@@ -144,12 +142,10 @@ class Settings:
         """
         if len(context) != len(self.contexts):
             names = ", ".join(self.context_names)
-            raise UserError(f"expected a number for each of {names}, got {tuple(context)}")
+            raise UserError(f"context must be a number for each of {names}, got {tuple(context)}")
         for value, each in zip(context, self.contexts, strict=True):
             if not each.low <= value <= each.high:
-                raise UserError(
-                    f"{each.name} must be within {each.low:g} to {each.high:g} {each.unit}, got {value}"
-                )
+                raise range_error(each.name, value, each.low, each.high, each.unit)
         return [float(value) for value in context]
 
     def digest(self) -> str:
@@ -194,8 +190,7 @@ def _check_variables(contexts: Sequence[Context], parameters: Sequence[Parameter
 
 
 def _check_numbers(settings: Settings) -> None:
-    if settings.constraint not in CONSTRAINTS:
-        raise UserError(f"constraint must be one of {', '.join(CONSTRAINTS)}, got {settings.constraint!r}")
+    check_constraint(settings.constraint, CONSTRAINTS)
     if (settings.mean_kl_bound is None) != (settings.cov_kl_bound is None):
         raise UserError(
             "mean_kl_bound and cov_kl_bound must be numbers both, or null both, "

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from creps_jax.errors import UserError
+from creps_jax.policies.bounds import CLIP, SIGMOID
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import FeatureMap, describe
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
@@ -37,7 +38,7 @@ def settings_from_policy(learned: Learned, *, exploration: float = 1.0) -> Setti
         contexts=_variables(Context, learned.contexts),
         parameters=_variables(Parameter, learned.parameters),
         features=_settings_of_features(learned),
-        constraint="sigmoid" if learned.parameters.constraint == "sigmoid" else "clip",
+        constraint=SIGMOID if learned.parameters.constraint == SIGMOID else CLIP,
         first_policy=FirstPolicy(
             coef=tuple(tuple(shortest(row)) for row in learned.policy.coef),
             cov_chol=tuple(tuple(shortest(row)) for row in cov_chol),
@@ -123,7 +124,7 @@ def _start(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     """Return coefficients and covariance factor of a policy that does not depend on the context."""
     columns = [(each.start, each.spread, each.low, each.high) for each in settings.parameters]
     start, spread, low, high = np.array(columns, float).T
-    if settings.constraint == "sigmoid":
+    if settings.constraint == SIGMOID:
         # The slope of the sigmoid makes the spread, to first order, that of the parameters.
         share = (start - low) / (high - low)
         start, spread = np.log(share / (1 - share)), spread / ((high - low) * share * (1 - share))
@@ -146,7 +147,7 @@ def feature_map(settings: Settings) -> FeatureMap:
         raise UserError(str(error)) from error
 
 
-def space_of(variables: Sequence[Context], constraint: str = "clip") -> Space:
+def space_of(variables: Sequence[Context], constraint: str = CLIP) -> Space:
     """Return the variables of a session as a policy describes them."""
     low, high = ends(variables)
     return Space(
