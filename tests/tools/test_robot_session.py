@@ -536,7 +536,10 @@ def test_the_commands_lead_through_a_session(tmp_path, monkeypatch, capsys):
     def command(*arguments: object, code: int = 0) -> str:
         assert main(["session", *map(str, arguments)]) == code
         out, err = capsys.readouterr()
+        notices.append(err)
         return err if code else out
+
+    notices: list[str] = []
 
     monkeypatch.chdir(tmp_path)
     Path("arm.json").write_text(json.dumps(DEFINITION))
@@ -555,9 +558,11 @@ def test_the_commands_lead_through_a_session(tmp_path, monkeypatch, capsys):
     assert len(command("ask", "arm", "--more", 1, "--context", 1.25).splitlines()) == 8
     for number in (2, 3):
         command("tell", "arm", number, "--reward", -1)
+    assert notices[-1] == ""
     assert "the batch is complete, but 3 valid trials are too few" in command(
         "tell", "arm", 4, "--reward", -1
     )
+    assert notices[-1] == "learning from 3 trials ...\n"
     command("ask", "arm", "--more", 3)
     for number in (5, 6, 7):
         command("tell", "arm", number, "--reward", -number)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
@@ -137,6 +138,15 @@ def run(command: SessionCommand, *, say: Callable[[str], None]) -> None:
     _HANDLERS[type(command.action)](command.action, say)
 
 
+def _open(folder: Path) -> RobotSession:
+    return RobotSession.open(folder, on_learning=_announce)
+
+
+def _announce(num_trials: int) -> None:
+    """Say on stderr why the command is silent for some seconds; stdout has only its results."""
+    print(f"learning from {num_trials} trials ...", file=sys.stderr, flush=True)
+
+
 def _new(command: New, say: Callable[[str], None]) -> None:
     names = ("batch_size", "archive_size", "kl_bound", "seed")
     changes = {name: getattr(command, name) for name in names if getattr(command, name) is not None}
@@ -165,7 +175,7 @@ def _list(variables: Sequence[Context]) -> str:
 
 
 def _ask(command: Ask, say: Callable[[str], None]) -> None:
-    session = RobotSession.open(command.folder)
+    session = _open(command.folder)
     trials = session.ask(command.context or None, more=command.more)
     say(trial_table(session, trials))
     say(f"to run: {len(trials)} (exact numbers: {command.folder / TRIALS})")
@@ -189,7 +199,7 @@ def trial_table(session: RobotSession, trials: Sequence[Trial]) -> str:
 def _tell(command: Tell, say: Callable[[str], None]) -> None:
     if (command.reward is not None) + command.broken + command.repeat != 1:
         raise UserError("tell one of --reward X, --broken and --repeat")
-    session = RobotSession.open(command.folder)
+    session = _open(command.folder)
     if command.repeat:
         trial = session.repeat(command.trial, replace=command.replace)
         say(f"trial {trial.id} is pending: run it again\n\n{trial_table(session, [trial])}")
@@ -220,7 +230,7 @@ def _tell(command: Tell, say: Callable[[str], None]) -> None:
 def _status(command: Status, say: Callable[[str], None]) -> None:
     from creps_jax.tools.session import page
 
-    status = RobotSession.open(command.folder).status()
+    status = _open(command.folder).status()
     for line in page.summary(status):
         say(line)
     say("\n" + page.table(status))
@@ -229,7 +239,7 @@ def _status(command: Status, say: Callable[[str], None]) -> None:
 
 
 def _save(command: Save, say: Callable[[str], None]) -> None:
-    policy = RobotSession.open(command.folder).policy()
+    policy = _open(command.folder).policy()
     policy.save(command.to)
     say(f"policy: {command.to}")
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -65,9 +65,10 @@ class RobotSession:
     never saved. Use `RobotSession.create` or `RobotSession.open`.
     """
 
-    def __init__(self, folder: Path, settings: Settings):
+    def __init__(self, folder: Path, settings: Settings, *, on_learning: Callable[[int], None] | None = None):
         self.folder = folder
         self.settings = settings
+        self._on_learning = on_learning
         self._learner: Learner | None = None
 
     @classmethod
@@ -110,13 +111,20 @@ class RobotSession:
         return cls(Path(folder), settings)
 
     @classmethod
-    def open(cls, folder: str | os.PathLike[str]) -> "RobotSession":
-        """Go on with a session.
+    def open(
+        cls, folder: str | os.PathLike[str], *, on_learning: Callable[[int], None] | None = None
+    ) -> "RobotSession":
+        """Continue a session.
+
+        Args:
+            folder: its folder.
+            on_learning: called with the number of trials before the policy learns from them, which takes
+                seconds when it is compiled.
 
         Raises:
-            UserError: if the folder holds none, or a file of it is cut short or foreign.
+            UserError: if the folder holds no session, or one of its files is cut short or foreign.
         """
-        session = cls(Path(folder), storage.open_settings(Path(folder)))
+        session = cls(Path(folder), storage.open_settings(Path(folder)), on_learning=on_learning)
         session._record()
         return session
 
@@ -224,11 +232,18 @@ class RobotSession:
             files.sync_folder(self.folder)
 
     def _learned(self, record: Record) -> "Learner":
+        batches = record.batches(self.settings.batch_size)
+        num_before = 0 if self._learner is None else len(self._learner.updates)
+        if self._on_learning is not None and len(batches) > num_before:
+            trials = [trial for batch in batches for trial in batch]
+            kept = trials[-(self.settings.archive_size or 0) :]
+            self._on_learning(sum(not trial.is_broken for trial in kept))
+        # It starts jax.
         from creps_jax.tools.session.learner import Learner
 
         if self._learner is None:
             self._learner = Learner(self.settings)
-        self._learner.learn(record.batches(self.settings.batch_size))
+        self._learner.learn(batches)
         return self._learner
 
 
