@@ -38,13 +38,13 @@ _LOG_TWO_PI = 1.8378770664093453
 
 
 class LinearGaussian(NamedTuple):
-    """Hold the policy pi(theta | s) = N(theta | coef' varphi(s), cov_chol cov_chol').
+    """The policy pi(theta | s) = N(theta | coef' varphi(s), cov_chol cov_chol').
 
     Source: Abdolmaleki et al. 2016, Section 3.1.
     """
 
     coef: Float[Array, "p d"]
-    """The coefficients A: one row a feature, one column a parameter."""
+    """The coefficients A: one row for each feature, one column for each parameter."""
     cov_chol: Float[Array, "d d"]
     """The lower Cholesky factor of the covariance Sigma; its diagonal is positive."""
 
@@ -58,11 +58,12 @@ def start_policy(
     Args:
         features: The policy's features.
         theta_dim: Number d of parameters.
-        mean: Mean of the parameters: a number for all, or one for each.
+        mean: Mean of the free parameters, before bounds are applied: a number for all, or one for each.
+            `Space.free` turns parameters into free ones.
         std: Their standard deviations, likewise.
 
     Returns:
-        The policy, whose parameters are independent of each other.
+        The policy; its parameters are independent of each other.
 
     Raises:
         ValueError: If there is not one number for each parameter, a standard deviation is not above zero, or
@@ -88,33 +89,16 @@ def start_policy(
 
 
 def mean(policy: LinearGaussian, features: Float[Array, " p"]) -> Float[Array, " d"]:
-    """Return the mean parameters A' varphi(s) for a context.
-
-    Args:
-        policy: The policy.
-        features: Policy features varphi(s) of the context.
-
-    Returns:
-        The mean of theta.
+    """Return the mean parameters A' varphi(s) for the features of a context.
 
     Raises:
         ValueError: If the policy has another number of features.
     """
-    if features.shape != policy.coef.shape[:1]:
-        raise ValueError(f"features have to have shape {policy.coef.shape[:1]}, got {features.shape}")
-    return exact_dot(features, policy.coef)
+    return exact_dot(checks.array("features", features, policy.coef.shape[:1]), policy.coef)
 
 
 def sample(key: PRNGKey, policy: LinearGaussian, features: Float[Array, " p"]) -> Float[Array, " d"]:
-    """Draw parameters theta ~ pi(theta | s) for a context.
-
-    Args:
-        key: Random key.
-        policy: The policy.
-        features: Policy features varphi(s) of the context.
-
-    Returns:
-        One theta.
+    """Draw parameters theta ~ pi(theta | s) for the features of a context.
 
     Raises:
         ValueError: If the policy has another number of features.
@@ -125,42 +109,26 @@ def sample(key: PRNGKey, policy: LinearGaussian, features: Float[Array, " p"]) -
 
 
 def log_prob(policy: LinearGaussian, features: Float[Array, " p"], theta: Float[Array, " d"]) -> Scalar:
-    """Return the log density log pi(theta | s).
-
-    Args:
-        policy: The policy.
-        features: Policy features varphi(s) of the context.
-        theta: Parameters.
-
-    Returns:
-        The log density, in nats.
+    """Return the log density log pi(theta | s), in nats, for the features of a context.
 
     Raises:
         ValueError: If the policy has another number of features or parameters.
     """
     centre = mean(policy, features)
-    if theta.shape != centre.shape:
-        raise ValueError(f"theta has to have shape {centre.shape}, got {theta.shape}")
+    theta = checks.array("theta", theta, centre.shape)
     whitened = solve_triangular(policy.cov_chol, theta - centre, lower=True)
     return -0.5 * jnp.sum(whitened**2) - _half_log_det(policy) - 0.5 * _LOG_TWO_PI * centre.size
 
 
 def kl(policy: LinearGaussian, reference: LinearGaussian, features: Float[Array, " p"]) -> Scalar:
-    """Return the relative entropy KL(policy || reference) of theta for a context.
+    """Return the relative entropy KL(policy || reference) of theta, in nats, for the features of a context.
 
-    Args:
-        policy: The distribution over which the expectation is taken, usually the new policy.
-        reference: The distribution compared with, usually the old policy.
-        features: Policy features varphi(s) of the context.
-
-    Returns:
-        The relative entropy, in nats.
+    The expectation is taken over `policy`, usually the new one; `reference` is usually the old one.
 
     Raises:
         ValueError: If the policies differ in shape or have another number of features.
     """
-    if policy.coef.shape != reference.coef.shape:
-        raise ValueError(f"policies differ in shape: {policy.coef.shape} and {reference.coef.shape}")
+    checks.array("coef of the reference", reference.coef, policy.coef.shape)
     shift = mean(policy, features) - mean(reference, features)
     both = jnp.concatenate([policy.cov_chol, shift[:, None]], axis=1)
     ratio = solve_triangular(reference.cov_chol, both, lower=True)
@@ -229,8 +197,8 @@ def fit_weighted_ml(
 def _weighted_cov_chol(fit: Regression) -> Float[Array, "d d"]:
     """Return the Cholesky factor of the weighted covariance of residuals, in units of the parameters.
 
-    It is taken of the correlations: what has to be added to make these positive definite is then relative to
-    the spread of each parameter. A parameter without spread gets that of its rounding.
+    The correlations are factored: the multiple of the identity that makes them positive definite is then
+    relative to the spread of each parameter. The spread is at least the rounding of the parameter.
     """
     residual = fit.rest - exact_dot(fit.rows, fit.solution)
     # In print: Sigma = sum of d (theta - A' phi) (theta - A' phi)' / Z
@@ -319,7 +287,7 @@ def _kl_rows(policy: LinearGaussian, reference: LinearGaussian, features: Array)
 
 
 def _whitened(policy: LinearGaussian, features: Array, theta: Array) -> Array:
-    """Return what theta differs from the mean by, in units of the covariance's root."""
+    """Return the differences of theta from the mean, in units of the root of the covariance."""
     # One small inverse and a product: a triangular system for each sample takes many times as long.
     inverse = divided(jnp.eye(theta.shape[1], dtype=theta.dtype), policy.cov_chol.T)
     return exact_dot(theta - exact_dot(features, policy.coef), inverse)
@@ -337,7 +305,7 @@ def blended_cov_chol(
     The relative entropy to the old covariance is convex in the new one: the blend keeps its bounds.
     """
     share = jnp.asarray(share, new.dtype)
-    # In units of the old one nothing is lost to the squares of small spreads.
+    # In units of the old factor, squares of small spreads lose no digits.
     change = solve_triangular(old, new, lower=True)
     blend = (1.0 - share) * jnp.eye(old.shape[0], dtype=new.dtype) + share * exact_dot(change, change.T)
     is_between = (share > 0.0) & (share < 1.0)

@@ -521,11 +521,11 @@ def test_vmap_equals_loop():
 
 
 def test_bad_shapes_are_named():
-    with pytest.raises(ValueError, match=r"features have to have shape \(2,\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"features must have shape \(2,\), got \(3,\)"):
         mean(policy(), jnp.ones(3))
-    with pytest.raises(ValueError, match=r"theta has to have shape \(3,\), got \(2,\)"):
+    with pytest.raises(ValueError, match=r"theta must have shape \(3,\), got \(2,\)"):
         log_prob(policy(), FEATURES, jnp.ones(2))
-    with pytest.raises(ValueError, match=r"differ in shape: \(2, 3\) and \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"coef of the reference must have shape \(2, 3\), got \(2, 2\)"):
         kl(policy(), policy(np.ones((2, 2)), np.eye(2)), FEATURES)
     with pytest.raises(ValueError, match=r"theta must have shape \(4, d\) beside .*, got \(5, 3\)"):
         fit_weighted_ml(jnp.ones((4, 2)), jnp.ones((5, 3)), jnp.ones(5), ridge=0.0)
