@@ -1,4 +1,4 @@
-"""Draw contexts to learn from, and lay out contexts to evaluate on."""
+"""Draw contexts for learning, and lay out grids of contexts for evaluation."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -25,8 +25,8 @@ def gaussian_contexts(
     Args:
         low: Lower end of each context's range; a number is a context of one dimension.
         high: Upper end of each context's range.
-        std: Standard deviation of each context, by default a quarter of its range, so that 95 of
-            100 lie within it.
+        std: Standard deviation of each context, by default a quarter of its range: then 95 of 100 contexts
+            lie within the range.
         clip: Whether to move contexts outside the range to its ends.
 
     Returns:
@@ -42,14 +42,14 @@ def gaussian_contexts(
     if scale.shape not in [(1,), low.shape] or not np.all(scale >= checks.FLOAT32_TINY):
         raise ValueError(f"std must be positive, a number or of shape {low.shape}, got {std}")
     scale = np.broadcast_to(scale, low.shape)
-    # Beyond the largest number there is none to draw.
+    # Draws beyond the largest number of the format are moved to it.
     largest = np.full_like(low, checks.FLOAT32_MAX)
     limits = (low, high) if clip else (-largest, largest)
     return _Gaussian(*map(_numbers, (low / 2 + high / 2, scale, *limits)))
 
 
 def uniform_contexts(low: VectorLike, high: VectorLike) -> Sampler:
-    """Draw contexts evenly from a range.
+    """Draw contexts uniformly from a range.
 
     Args:
         low: Lower end of each context's range; a number is a context of one dimension.
@@ -66,7 +66,7 @@ def uniform_contexts(low: VectorLike, high: VectorLike) -> Sampler:
 
 @checks.arguments
 def context_grid(low: VectorLike, high: VectorLike, num: int | Sequence[int]) -> Float[Array, "n s"]:
-    """Lay out contexts evenly over a range, both ends included, to evaluate a policy on.
+    """Lay out a grid of contexts over a range, both ends included, to evaluate a policy on.
 
     Args:
         low: Lower end of each context's range; a number is a context of one dimension.
@@ -77,7 +77,7 @@ def context_grid(low: VectorLike, high: VectorLike, num: int | Sequence[int]) ->
         All combinations, `num ** s` for one number, the last dimension varying fastest.
 
     Raises:
-        ValueError: If the ends do not fit each other, or `num` is less than 2 or far too many.
+        ValueError: If the ends do not fit each other, or `num` is below 2 or gives too many contexts.
     """
     low, high = _checked_range(low, high)
     counts = checks.grid("num", num, low.size, least=2)
@@ -93,7 +93,7 @@ def context_grid(low: VectorLike, high: VectorLike, num: int | Sequence[int]) ->
 
 @dataclasses.dataclass(frozen=True)
 class _Gaussian:
-    """Draw from a Gaussian, and move what is outside the limits to them."""
+    """Draw from a Gaussian, and clip to the limits."""
 
     mean: tuple[float, ...]
     std: tuple[float, ...]
@@ -108,7 +108,7 @@ class _Gaussian:
 
 @dataclasses.dataclass(frozen=True)
 class _Uniform:
-    """Draw evenly from a range."""
+    """Draw uniformly from a range."""
 
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -121,9 +121,9 @@ class _Uniform:
 
 
 def _halves(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return 0.5 where a range is wider than the largest number, and 1 elsewhere.
+    """Return 0.5 for ranges near or beyond the largest number, and 1 for others.
 
-    Multiplied with powers of two, results are the same to the bit.
+    Both are powers of two: results are the same to the bit.
     """
     width = high.astype(float) - low
     return np.where(width > checks.FLOAT32_MAX / 2, np.float32(0.5), np.float32(1.0))

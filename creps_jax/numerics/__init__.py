@@ -1,1 +1,1 @@
-"""Numbers: linear algebra, minimisation, rotations, curves."""
+"""Numerics: linear algebra, minimisation, rotations, curves."""

@@ -30,7 +30,7 @@ _Pair: TypeAlias = tuple[Array, Array]
 def exact_dot(left: Float[Array, "..."], right: Float[Array, "..."]) -> Float[Array, "..."]:
     """Multiply vectors or matrices as `jnp.dot` does, in the full precision of their format.
 
-    Accelerators otherwise multiply float32 matrices with a mantissa of 10 bits.
+    By default accelerators multiply float32 matrices with a mantissa of 10 bits.
     """
     return jnp.dot(left, right, precision=lax.Precision.HIGHEST)
 
@@ -44,9 +44,9 @@ def thomas_solve(
 ) -> Float[Array, " n"]:
     """Solve a tridiagonal system by the Thomas algorithm.
 
-    Row k reads `lower[k] x[k-1] + diag[k] x[k] + upper[k] x[k+1] = rhs[k]`. Elimination does not pivot: the
-    system has to be diagonally dominant (as that of the centre of mass is) or positive definite. Several
-    right-hand sides are a `jax.vmap` over `rhs`.
+    Row k is `lower[k] x[k-1] + diag[k] x[k] + upper[k] x[k+1] = rhs[k]`. Elimination does not pivot: the
+    system must be diagonally dominant (as for the centre of mass) or positive definite. For several
+    right-hand sides use `jax.vmap` over `rhs`.
 
     Args:
         lower: Entries below the diagonal; `lower[0]` is not used.
@@ -61,9 +61,9 @@ def thomas_solve(
         ValueError: If the four are not vectors of one length n >= 1, a number is not finite, or a pivot is
             zero.
 
-    Source: Abdolmaleki et al. 2016, Eq. 7 and 8 (with `a(k)` in the denominator, which the print has wrong).
+    Source: Abdolmaleki et al. 2016, Eq. 7 and 8 (with `a(k)` in the denominator, where the print is wrong).
     """
-    # What is not used must not enter: zero times a non-finite number is not zero.
+    # Entries that are not used may be anything: zero times a number that is not finite is not zero.
     lower = lower.at[0].set(0.0)
     upper = upper.at[-1].set(0.0)
     for name, entries in (("lower", lower), ("diag", diag), ("upper", upper), ("rhs", rhs)):
@@ -89,13 +89,13 @@ def thomas_solve(
 
 
 def normalised(weights: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Divide weights, not negative and of any size, by their sum; relatively tiny ones become zero.
+    """Divide weights, not negative and of any size, by their sum; very small ones and zeros become zero.
 
-    Zeros stay zeros. Compiled code reads denormal numbers as zero, and divides by multiplying with a
-    reciprocal, which is one for large divisors; sums of large numbers overflow.
+    Plain code fails for extreme weights: compiled programs round denormal numbers to zero, and divide by
+    multiplying with a reciprocal, which is denormal for large divisors; sums of large numbers overflow.
     """
     info, bits = jnp.finfo(weights.dtype), as_bits(weights)
-    # As an integer a denormal number is itself in units of the smallest one.
+    # The bits of a denormal number, as an integer, are the number in units of the smallest one.
     is_denormal = (bits > 0) & (bits < 1 << info.nmant)
     in_units = jnp.where(is_denormal, bits.astype(weights.dtype), 0.0)
     of_units = info.minexp - info.nmant
@@ -104,7 +104,7 @@ def normalised(weights: Float[Array, " n"]) -> Float[Array, " n"]:
         jnp.frexp(jnp.max(weights))[1],
         jnp.frexp(jnp.max(in_units))[1] + of_units,
     )
-    # By powers of two the largest becomes about one. It cancels, and needs no gradient.
+    # Powers of two make the largest weight about one. They cancel, and need no gradient.
     others = times_power(weights, -largest)
     weights = jnp.where(is_denormal, times_power(in_units, of_units - largest), others)
     weights = jnp.where(weights >= info.tiny, weights, 0.0)
@@ -112,32 +112,32 @@ def normalised(weights: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 def as_bits(values: Float[Array, "..."]) -> Int[Array, "..."]:
-    """Return numbers as integers of the same bits: above zero where and only where the number is."""
+    """Return numbers as integers of the same bits: an integer is above zero exactly if the number is."""
     values = lax.stop_gradient(values)
     return lax.bitcast_convert_type(values, jnp.dtype(f"int{jnp.finfo(values.dtype).bits}"))
 
 
 def times_power(values: Float[Array, "..."], exponent: Int[Array, "..."] | int) -> Float[Array, "..."]:
-    """Multiply values by two to a power, faster than `ldexp` where one power is that of many values."""
-    half, one = exponent // 2, jnp.ones((), values.dtype)  # a whole power can be beyond the format
+    """Multiply values by two to a power, faster than `ldexp` for one power and many values."""
+    half, one = exponent // 2, jnp.ones((), values.dtype)  # the power itself can be beyond the format
     return values * jnp.ldexp(one, half) * jnp.ldexp(one, exponent - half)
 
 
 def weighted_mean(rows: Float[Array, "n m"], weights: Float[Array, " n"]) -> Float[Array, " m"]:
     """Return the mean of finite rows, for weights that sum to one, or zero if all weights are zero."""
     middle = exact_dot(weights, rows)
-    # The first sum is rounded in units of the offset of the rows, as often as there are rows.
+    # In the first sum each row adds a rounding error of the size of the offset of the rows.
     return middle + exact_dot(weights, rows - middle[None, :])
 
 
 def safe_sqrt(values: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the root of values, and zero, with a gradient of zero, where they are not positive."""
+    """Return the square root of positive values; for others zero, with a gradient of zero."""
     is_positive = values > 0
     return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, values, 1.0)), 0.0)
 
 
 def safe_norm(vector: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return the length of a vector, with a gradient of zero where it is zero."""
+    """Return the length of a vector, with a gradient of zero for the zero vector."""
     return safe_sqrt(jnp.sum(vector**2))
 
 
@@ -150,29 +150,29 @@ def safe_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """Factor a symmetric matrix after adding the least multiple of the identity that makes it definite.
 
     Args:
-        matrix: Symmetric matrix, meant to be positive definite; only its symmetric part counts. Its diagonal
-            should have like entries (that of a correlation matrix has), because what is added is relative to
-            the largest entry. Entries that are not finite count as zero.
+        matrix: Symmetric matrix, about positive definite; only its symmetric part is used. The entries of its
+            diagonal should be of one size (as in a correlation matrix), because the multiple is relative to
+            the largest entry. Entries that are not finite are replaced by zero.
 
     Returns:
         Lower triangular L, finite and with a positive diagonal, `L L' = matrix + jitter I`. The jitter is
-        zero where the smallest eigenvalue is above the rounding error of the largest. A matrix of zeros gets
-        the jitter of the identity.
+        zero if the smallest eigenvalue is above the rounding error of the largest. A matrix of zeros gets the
+        jitter of the identity.
 
     Raises:
         ValueError: If the matrix is not square.
     """
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-        raise ValueError(f"safe_cholesky needs a square matrix, got shape {matrix.shape}")
+        raise ValueError(f"matrix must be square, got shape {matrix.shape}")
     matrix = jnp.where(jnp.isfinite(matrix), matrix, 0.0)
     scale = jnp.max(jnp.abs(matrix))
     scale = jnp.where(scale > 0, scale, 1.0)
     unit = matrix / scale
     unit = 0.5 * (unit + unit.T)
     size = matrix.shape[0]
-    # Eigenvalues carry an error of about d eps; the smallest has to be above it for the factor to exist.
+    # Eigenvalues have an error of about d eps; the factor exists if the smallest one is above it.
     least = 4.0 * size * jnp.finfo(matrix.dtype).eps
-    # Where eigenvalues coincide they have no gradient, and what is added is no more than rounding.
+    # Equal eigenvalues have no gradient, and the jitter is of the size of rounding.
     jitter = lax.stop_gradient(jnp.maximum(least - jnp.linalg.eigvalsh(unit)[0], 0.0))
     return jnp.linalg.cholesky(unit + jitter * jnp.eye(size, dtype=matrix.dtype)) * jnp.sqrt(scale)
 
@@ -182,15 +182,15 @@ def centre_columns(rows: Float[Array, "n m"], weights: Float[Array, " n"]) -> Fl
 
     Args:
         rows: Rows, all of them finite.
-        weights: Weights of the rows, not negative, that sum to one; a row of weight zero does not count.
+        weights: Weights of the rows, not negative, that sum to one.
 
     Returns:
-        The centred rows. Rows that do not count, and columns that are constant up to rounding, are zero.
+        The centred rows. Rows of weight zero, and columns that are constant up to rounding, are zero.
     """
     counts = (weights > 0)[:, None]
     centred = jnp.where(counts, rows, 0.0)
     rounding = 4.0 * jnp.finfo(rows.dtype).eps * jnp.max(jnp.abs(centred), axis=0)
-    for _ in range(2):  # the first mean is rounded in units of the offset
+    for _ in range(2):  # the first mean has a rounding error of the size of the offset
         centred = jnp.where(counts, centred - exact_dot(weights, centred)[None, :], 0.0)
     is_constant = jnp.max(jnp.abs(centred), axis=0) <= rounding
     return jnp.where(is_constant[None, :], 0.0, centred)
@@ -207,25 +207,25 @@ def whitened_regression(
 
     Args:
         centred: Rows with a mean of zero, from `centre_columns`.
-        target: What the rows are to explain, with a mean of zero as well.
+        target: The target of a least-squares fit, with a mean of zero as well.
         weights: Weights of the rows in these means, not negative; they sum to one.
-        least_spread: Directions with less spread than this, in columns scaled to spread one, are taken for
+        least_spread: Directions with less spread than this, in columns scaled to spread one, are treated as
             rounding: their columns of W are zero.
 
     Returns:
-        W, with k = min(n, m) columns, and the coefficients of the least-squares fit of the target. The fit
-        leaves out only directions that the format can't tell from rounding, whatever `least_spread`.
+        W, with k = min(n, m) columns, and the coefficients of the least-squares fit of the target. For any
+        `least_spread`, the fit leaves out only directions that the format cannot distinguish from rounding.
     """
     root = jnp.sqrt(weights)
     rows = root[:, None] * centred
     unscale = _invert_above(jnp.linalg.norm(rows, axis=0), 0.0)
     both = jnp.concatenate([rows * unscale[None, :], (root * target)[:, None]], axis=1)
-    # Singular values of the columns, not eigenvalues of their products: those would square the rounding.
+    # Singular values of the columns: eigenvalues of their products would square the rounding.
     triangular = jnp.linalg.qr(both, mode="r")[: centred.shape[1]]
     columns, values = triangular[:, :-1], triangular[:, -1]
     left, singular_values, axes = jnp.linalg.svd(columns, full_matrices=False)
     inverse = axes.T * _invert_above(singular_values, least_spread)[None, :]
-    # First what is certain: in the directions of rounding the target itself would have huge coefficients.
+    # First the directions above rounding: in the others the target itself would have huge coefficients.
     coef = exact_dot(inverse, exact_dot(values, left))
     least = 4.0 * math.sqrt(centred.shape[1]) * jnp.finfo(centred.dtype).eps
     rest = exact_dot(values - exact_dot(columns, coef), left)

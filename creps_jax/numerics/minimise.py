@@ -1,4 +1,4 @@
-"""Minimise a smooth convex function of a few variables: the one minimiser of the library."""
+"""Minimise a smooth convex function of a few variables by Newton's method."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,22 +12,22 @@ from creps_jax.typing import Array, Bool, Float, Int, Scalar, ScalarLike
 __all__ = ["Minimum", "minimise"]
 
 _NUM_TRIALS = 6
-"""Step lengths that are tried: 1, 1/4, ..., 1/1024 of the Newton step."""
+"""Number of step lengths that are tried: 1, 1/4, ..., 1/1024 of the Newton step."""
 _NEAR_MINIMUM = 0.5
-"""Slope, as a share of that at the start, up to which a point is near the minimum along a step."""
+"""A point is near the minimum along a step if its slope is at most this share of the slope at the start."""
 _FLAT = 8.0
-"""Least curvature of an axis, as a share of the largest, in units of the rounding of the format."""
+"""Least curvature of an axis relative to the largest curvature, in units of the rounding of the format."""
 
 
 class Minimum(NamedTuple):
-    """Where a minimisation ended, and how."""
+    """The result of a minimisation."""
 
     point: Float[Array, " k"]
     value: Float[Array, ""]
     grad_norm: Float[Array, ""]
     num_steps: Int[Array, ""]
     is_converged: Bool[Array, ""]
-    """Whether the norm of the gradient came below the tolerance."""
+    """Whether the norm of the gradient is within the tolerance."""
 
 
 class _Search(NamedTuple):
@@ -63,30 +63,30 @@ def minimise(
 
     The Hessian may be singular (the function may be flat along some directions) and, away from the minimum,
     even indefinite (a convex function of x is not convex in log x): steps use the absolute values of its
-    eigenvalues. The step length is the longest of a fixed ladder that is as good as the best of it. Near the
-    minimum, where values no longer differ in the floating-point format, the slope decides.
+    eigenvalues. The step length is the longest of a fixed list whose value is the best one up to rounding.
+    Near the minimum, where values no longer differ in the floating-point format, slopes are compared.
 
     Args:
-        function: What to minimise; scaled such that values and gradients of order one matter.
-        start: First point, where the function has to be finite.
-        hessian: The matrix of second derivatives, where it is known; by default that of `jax.hessian`.
+        function: The function, scaled such that changes of order one in values and gradients matter.
+        start: First point, at which the function must be finite.
+        hessian: The matrix of second derivatives, if it is known; by default `jax.hessian` computes it.
         max_steps: Largest number of Newton steps.
         tolerance: Norm of the gradient at which the search ends; by default 9e-7 in float32 and 2e-14 in
             float64.
-        max_change: Largest change of each variable in a step along one axis: how far the quadratic model of
-            the function may be trusted.
+        max_change: Largest change of each variable in a step along one axis: the range in which the quadratic
+            model of the function is trusted.
 
     Returns:
-        The last point, which beyond rounding is never worse than the start. The search also ends, without
-        convergence, when rounding allows no further progress.
+        The last point; up to rounding, its value is never larger than at the start. The search also ends,
+        without convergence, if rounding allows no further progress.
 
     Raises:
         ValueError: If `start` is not a vector or `max_steps` is below 1.
     """
     if start.ndim != 1 or start.size == 0:
-        raise ValueError(f"minimise needs a start of shape (k,), k >= 1, got shape {start.shape}")
+        raise ValueError(f"start must have shape (k,), k >= 1, got {start.shape}")
     if max_steps < 1:
-        raise ValueError(f"minimise needs max_steps >= 1, got {max_steps}")
+        raise ValueError(f"max_steps must be at least 1, got {max_steps}")
     if tolerance is None:
         tolerance = float(jnp.finfo(start.dtype).eps) ** (7 / 8)
     limits = jnp.broadcast_to(jnp.asarray(max_change, start.dtype), start.shape)
@@ -109,20 +109,20 @@ def minimise(
 
 
 def _newton_step(grad: Array, hessian: Array, max_change: Array) -> Array:
-    """Return a descent step: that of Newton, made safe along each principal axis of the Hessian by itself."""
+    """Return Newton's step, made a safe descent step along each principal axis of the Hessian separately."""
     eps = float(jnp.finfo(hessian.dtype).eps)
     flat, no_curvature = _FLAT * eps, (_FLAT * eps) ** 2  # divisors stay above zero
-    # Variables may have different units: a diagonal of ones gives "flat" one meaning for all.
+    # Variables may have different units: a diagonal of ones makes "flat" mean the same for all.
     diagonal = jnp.abs(jnp.diagonal(hessian))
     unit = jnp.sqrt(jnp.maximum(diagonal, flat * jnp.max(diagonal) + no_curvature))
     curvature, axes = jnp.linalg.eigh(hessian / (unit[:, None] * unit[None, :]))
     curvature, slopes = jnp.abs(curvature), jnp.sum(axes * (grad / unit)[:, None], axis=0)
     least = flat * jnp.max(curvature) + no_curvature
-    # Where the function is flat a slope is rounding: do not follow it.
+    # Along flat axes the slope is rounding: do not follow it.
     is_flat = (curvature <= least) & (jnp.abs(slopes) <= 10.0 * flat * jnp.max(jnp.abs(slopes)))
     lengths = jnp.where(is_flat, 0.0, -slopes / jnp.maximum(curvature, least))
-    steps = axes * lengths[None, :] / unit[:, None]  # a column an axis
-    # An axis without curvature asks for a very long step: it alone is shortened, others keep theirs.
+    steps = axes * lengths[None, :] / unit[:, None]  # one column for each axis
+    # An axis without curvature has a very long step: only this one is shortened.
     excess = jnp.max(jnp.abs(steps) / max_change[:, None], axis=0)
     return jnp.sum(steps / jnp.maximum(excess, 1.0)[None, :], axis=1)
 
@@ -130,9 +130,9 @@ def _newton_step(grad: Array, hessian: Array, max_change: Array) -> Array:
 def _line_search(
     value_and_grad: Callable[[Array], tuple[Array, Array]], search: _Search, step: Array
 ) -> _Search:
-    """Move along the step by the longest trial length that is as good as the best one, to rounding.
+    """Move along the step by the longest trial length whose value is the best one up to rounding.
 
-    Trials end with a length that is near the minimum along the step, as the first one mostly is.
+    Trials end at a length that is near the minimum along the step; mostly this is the first one.
     """
     slope = jnp.sum(search.grad * step)
     rounding = 8.0 * jnp.finfo(step.dtype).eps * (1.0 + jnp.abs(search.value))
@@ -145,7 +145,7 @@ def _line_search(
         point = search.point + length * step
         value, grad = value_and_grad(point)
         new_slope = jnp.sum(grad * step)
-        # Sufficient decrease, or (approximate Wolfe, Hager & Zhang 2005) what the slope tells of it.
+        # Sufficient decrease, judged by the value or by the slope (approximate Wolfe, Hager & Zhang 2005).
         is_lower = value <= search.value + 1e-4 * length * slope - rounding
         is_flatter = (value <= search.value + rounding) & (new_slope <= -0.8 * slope)
         is_finite = jnp.isfinite(value) & jnp.all(jnp.isfinite(grad))

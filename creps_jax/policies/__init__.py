@@ -1,1 +1,1 @@
-"""What is learned: a distribution of parameters for each context."""
+"""Policies: distributions of parameters that depend on a context."""

@@ -1,4 +1,4 @@
-"""What a policy is to a search: a few functions of its parameters and of features of the context."""
+"""The interface of a policy to a search: functions of its parameters and of features of the context."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,27 +10,27 @@ __all__ = ["Policy", "WeightedSamples"]
 
 
 class WeightedSamples(NamedTuple):
-    """What a policy is fitted to."""
+    """The samples that a policy is fitted to."""
 
     features: Float[Array, "n p"]
     """Policy features of the context of each sample."""
     theta: Float[Array, "n d"]
     weights: Float[Array, " n"]
-    """Weights d, which sum to one; a sample of weight zero may hold anything."""
+    """Weights d, which sum to one; other values of a sample with weight zero are not used."""
     is_valid: Bool[Array, " n"]
-    """Which samples count: over their contexts relative entropies are averaged."""
+    """Which samples are valid: relative entropies are averaged over their contexts."""
     constant: Float[Array, " p"] | None = None
     """Coefficients whose sum with the features is one, see `FeatureMap.constant`; None if not stated."""
 
 
 class Policy(NamedTuple):
-    """A kind of policy, as a record of pure functions; `state` is what one policy of this kind consists of.
+    """A kind of policy, as a record of pure functions; `state` holds the parameters of one policy.
 
-    The state is any pytree of arrays. Functions of contexts take their features x (n, p), a row each.
+    The state is any pytree of arrays. Functions of contexts take their features x (n, p), one row for each.
     """
 
     features: FeatureMap
-    """What the policy is told of a context."""
+    """The features of the context that the policy depends on."""
     mean: Callable[[Any, Array], Array]
     """(state, x) -> thetas (n, d) without exploration."""
     sample: Callable[[PRNGKey, Any, Array], Array]
@@ -44,10 +44,10 @@ class Policy(NamedTuple):
     fit: Callable[[Any, WeightedSamples], Any]
     """(old state, samples) -> state: the next policy."""
     blend: Callable[[Any, Any, Scalar], Any] | None = None
-    """(old state, fitted state, share) -> state whose exploration has moved by this share, from 0 to 1, of
-    its way. Without it a search has to move all the way, whatever the evidence (`significance=None`)."""
+    """(old state, fitted state, share) -> state whose exploration has moved by this share, from 0 to 1, from
+    the old to the fitted one. Without it a search must move all the way: `significance=None`."""
     noise: Callable[[Any, Array, Array], Array] | None = None
-    """(state, x, thetas) -> what exploration has added to the mean (n, d), in units of its standard
-    deviations; by default the difference of thetas and mean."""
+    """(state, x, thetas) -> the exploration (n, d): thetas less the mean, in standard deviations; by default
+    thetas less the mean."""
     checked: Callable[[str, Any, FeatureMap], Any] | None = None
     """(name, state, features) -> the state in one precision, or a ValueError that names what is wrong."""

@@ -1,4 +1,4 @@
-"""Name features by plain settings, as runs, sessions and files hold them."""
+"""Plain settings of features, for runs, sessions and files; jax starts when the features are made."""
 
 import dataclasses
 from typing import TYPE_CHECKING
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
 __all__ = ["FEATURE_KINDS", "Features"]
 
 FEATURE_KINDS = ("linear", "rbf")
-"""What `Features` can name."""
+"""The kinds of features that `Features` can make."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Features:
-    """Settings of features, as runs, sessions and files hold them.
+    """Settings of features, for runs, sessions and files.
 
     Attributes:
         kind: One of `FEATURE_KINDS`.
@@ -55,7 +55,7 @@ class Features:
         raise ValueError(f"features must be one of {', '.join(FEATURE_KINDS)}, got {self.kind!r}")
 
     def make_baseline(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
-        """Return the baseline features that go with these: quadratic ones for linear policies, else the same.
+        """Return the baseline features for these: quadratic ones for linear policies, else the same.
 
         Raises:
             ValueError: As `make` does.

@@ -1,4 +1,4 @@
-"""Carry a learned policy away: a value that describes itself, and its file."""
+"""A learned policy with everything that is needed to use it, and its file."""
 
 import dataclasses
 import json
@@ -41,8 +41,8 @@ class Learned:
         policy: The distribution of free parameters, before bounds are applied.
         features: The features of the context.
         contexts: The context variables, with the ranges that the policy was learned for.
-        parameters: The parameters, with their bounds and how these are held.
-        task: What it was learned for: the name of the task, and the settings that it was learned with.
+        parameters: The parameters, with their bounds and how they are kept within them.
+        task: The name of the task that it was learned for, and the settings that it was learned with.
 
     Raises:
         ValueError: If the fields do not fit each other, or a number of the policy is not finite.
@@ -93,8 +93,8 @@ class Learned:
             named: The same by name, in place of `context`.
 
         Raises:
-            ValueError: If there are more or fewer, or one is outside the range that was learned; see
-                `in_range`.
+            ValueError: If there is not a number for each variable, or one is outside the range that the
+                policy was learned for; see `in_range`.
         """
         if named:
             names = self.contexts.names
@@ -121,7 +121,7 @@ class Learned:
         return np.asarray(self.features(numbers)) @ np.asarray(self.policy.coef)
 
     def in_range(self, *context: Any) -> bool:
-        """Say whether a context is within the range that the policy was learned for.
+        """Return whether a context is within the range that the policy was learned for.
 
         Raises:
             ValueError: If there is not a number for each context variable.
@@ -129,7 +129,7 @@ class Learned:
         return self.contexts.contains(_flat(context))
 
     def thetas(self, contexts: Float[Array, "n s"]) -> Float[Array, "n d"]:
-        """Return the parameters for many contexts; it can be jitted, and does not look at the range."""
+        """Return the parameters for many contexts; it can be jitted, and does not check the range."""
         return self.parameters.inside(jnp.asarray(self.features(contexts)) @ self.policy.coef)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -145,8 +145,8 @@ def save(path: str | os.PathLike[str], learned: Learned) -> None:
         learned: The policy.
 
     Raises:
-        ValueError: If its features are a user's own and have no name, the path is no .npz file, or it cannot
-            be written.
+        ValueError: If its features are the user's own and have no name, the path is no .npz file, or the file
+            cannot be written.
     """
     file = _checked_path(path)
     if file.suffix != ".npz":
@@ -175,11 +175,11 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
 
     Args:
         path: The file.
-        features: Your own features, where the policy was learned with such.
+        features: Your own features, if the policy was learned with them.
 
     Raises:
-        ValueError: If the file is missing, cut short, foreign, of another version, or holds what no policy
-            can hold (NaN, shapes that do not fit each other), or your own features are needed.
+        ValueError: If the file is missing, cut short, foreign or of another version, if its numbers make no
+            policy (NaN, shapes that do not fit each other), or if your own features are needed.
     """
     file = _checked_path(path)
     arrays = load_arrays(file)
@@ -207,7 +207,7 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
 
 
 def _flat(context: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the numbers of a context that was given as one sequence."""
+    """Return the numbers of a context, which may be one sequence of them."""
     is_sequence = len(context) == 1 and np.ndim(context[0]) == 1 and not isinstance(context[0], str)
     return tuple(context[0]) if is_sequence else context
 
@@ -222,7 +222,7 @@ def _space(
 def _features(
     description: Any, context_range: tuple[list[float], list[float]], own: FeatureMap | None
 ) -> FeatureMap:
-    """Make the features of a file; those of version 2 are over the range of the contexts."""
+    """Make the features of a file; in version 2 they cover the range of the contexts."""
     if not isinstance(description, dict):
         raise ValueError(f"features must be described by an object, got {description!r}")
     if description.get("kind") == "rbf" and "low" not in description:

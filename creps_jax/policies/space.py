@@ -1,4 +1,4 @@
-"""Describe contexts and parameters, and keep parameters inside their bounds."""
+"""Describe contexts and parameters, and keep parameters within their bounds."""
 
 import dataclasses
 import math
@@ -18,7 +18,7 @@ from creps_jax.typing import Array, Float, ScalarLike, VectorLike
 __all__ = ["Space", "penalty", "sigmoid_gate", "sigmoid_gate_inverse", "violation"]
 
 _WIDE = 1e37
-"""Width of a box from which it, or its inverse, can be out of the range of float32."""
+"""Width of a box above which the width, or its inverse, can be outside the range of float32."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,16 +27,16 @@ class Space:
 
     Attributes:
         names: A name for each of the n variables.
-        low: Lower ends; minus infinity where there is none.
-        high: Upper ends.
+        low: Lower ends; minus infinity for no end.
+        high: Upper ends; infinity for no end.
         units: Units, by default none.
         constraint: How the numbers that a search draws become parameters within their bounds: "sigmoid"
             squashes them, as `sigmoid_constrained` does in learning, "clip" cuts them off at the bounds,
             "none" leaves them.
 
     Raises:
-        ValueError: If names are missing or equal, there is not one end and unit for each, an end is no
-            number, a lower one is above the upper one, or a sigmoid has no finite ends.
+        ValueError: If names are missing or equal, there is not one end and one unit for each name, an end is
+            not a number, a lower end is above the upper end, or a sigmoid has an infinite end.
     """
 
     names: tuple[str, ...]
@@ -46,7 +46,7 @@ class Space:
     constraint: str = CLIP
 
     def __post_init__(self) -> None:
-        """Check the fields, and turn sequences into tuples."""
+        """Check the fields, and convert sequences to tuples."""
         if not isinstance(self.names, str | tuple | list):
             raise ValueError(f"names must be a sequence of texts, got {checks.shown(self.names)}")
         names = (self.names,) if isinstance(self.names, str) else tuple(self.names)
@@ -108,7 +108,7 @@ class Space:
         """Return a number for each variable as an array (n,).
 
         Raises:
-            ValueError: If there are more or fewer, or one is no number.
+            ValueError: If there is not a number for each variable.
         """
         try:
             numbers = np.array([float(value) for value in values])
@@ -122,14 +122,14 @@ class Space:
         return numbers
 
     def contains(self, values: Sequence[Any]) -> bool:
-        """Say whether each number is within its range; ends that went through single precision are."""
+        """Return whether each number is within its range, up to the rounding of single precision."""
         return self._outside(self.numbers(values)) is None
 
     def checked(self, values: Sequence[Any]) -> np.ndarray:
         """Return numbers (n,) after checking that they are within the ranges.
 
         Raises:
-            ValueError: If there are more or fewer, or one is no number or out of its range.
+            ValueError: If there is not a number for each variable, or one is out of its range.
         """
         numbers = self.numbers(values)
         found = self._outside(numbers)
@@ -139,7 +139,7 @@ class Space:
         return numbers
 
     def _outside(self, numbers: np.ndarray) -> int | None:
-        """Return the first variable that is out of its range."""
+        """Return the index of the first variable that is out of its range."""
         for index, (value, low, high) in enumerate(zip(numbers, self.low, self.high, strict=True)):
             slack = 1e-6 * (high - low) if math.isfinite(high - low) else 0.0
             if not (low - slack <= value <= high + slack and math.isfinite(value)):
@@ -169,23 +169,23 @@ def sigmoid_gate(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike)
     Args:
         theta: Free parameters, any real numbers.
         low: Lower bounds, in the units of the result.
-        high: Upper bounds; a parameter whose bounds are equal, or so close that float32 takes their
-            difference for zero, is fixed at them.
+        high: Upper bounds; a parameter whose bounds are equal in float32, or differ by less than its smallest
+            number, is fixed at them.
 
     Returns:
         Parameters in [low, high]; zero goes to the middle of the box.
 
     Raises:
-        ValueError: If bounds do not fit the parameters or each other, or a number is none.
+        ValueError: If bounds do not fit the parameters or each other, or a value is not a number.
 
     Source: Abdolmaleki et al. 2016, Eq. 17.
     """
     theta, low, high = _box(theta, low, high)
-    # Divided by a power of two, results are the same to the bit.
+    # The unit is a power of two: results are the same to the bit.
     unit = jnp.where(high - low > _WIDE, 16.0, 1.0).astype(theta.dtype)
     # In print: theta' = 1 / (1 + exp(-theta)) (UB - LB) + LB
     gated = (low / unit + jax.nn.sigmoid(theta) * (high / unit - low / unit)) * unit  # Eq. 17
-    # The clip takes back the last bit that rounding can put outside the box.
+    # Rounding can put the last bit outside the box.
     return jnp.clip(gated, low, high)
 
 
@@ -195,23 +195,23 @@ def sigmoid_gate_inverse(
     """Find the free parameters that `sigmoid_gate` squashes to the given ones.
 
     Args:
-        theta: Parameters inside the box; outside it they count as at the nearest bound.
+        theta: Parameters inside the box; those outside are moved to the nearest bound.
         low: Lower bounds.
         high: Upper bounds.
 
     Returns:
-        Free parameters. A parameter at a bound, which only infinity reaches, gets the last finite
-        value that float32 tells from the bound (about 16); a fixed parameter gets zero.
+        Free parameters. A parameter at a bound, which only infinity reaches, gets the largest number whose
+        result differs from the bound in float32 (about 16); a fixed parameter gets zero.
 
     Raises:
-        ValueError: If bounds do not fit the parameters or each other, or a number is none.
+        ValueError: If bounds do not fit the parameters or each other, or a value is not a number.
     """
     theta, low, high = _box(theta, low, high)
     width = high - low
     is_wide = width > _WIDE
     is_free = (width >= float(jnp.finfo(width.dtype).tiny)) & ~is_wide
     fraction = jnp.where(is_free, (theta - low) / jnp.where(is_free, width, 1.0), 0.5)
-    # Without the width of a wide box, which overflows: compiled programs take its inverse for zero.
+    # Without the width of a wide box, which overflows, and whose inverse compiled programs round to zero.
     inside = jnp.clip(theta, low, high)
     below, above = 0.5 * inside - 0.5 * low, 0.5 * high - 0.5 * inside
     fraction = jnp.where(is_wide, below / jnp.where(is_wide, below + above, 1.0), fraction)
@@ -223,7 +223,7 @@ def violation(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) ->
     """Measure how far each parameter lies outside its bounds: zero inside, positive and finite outside.
 
     Raises:
-        ValueError: If bounds do not fit the parameters or each other, or a number is none.
+        ValueError: If bounds do not fit the parameters or each other, or a value is not a number.
     """
     theta, low, high = _box(theta, low, high, largest=math.inf)
     distance = jnp.maximum(jnp.maximum(low - theta, theta - high), 0.0)
@@ -231,7 +231,7 @@ def violation(theta: Float[Array, "*b d"], low: VectorLike, high: VectorLike) ->
 
 
 def penalty(violation: Float[Array, "*b c"], size: ScalarLike) -> Float[Array, "*b"]:
-    """Charge `size` where any constraint is violated, however little.
+    """Return `size` where any constraint is violated by any amount, else zero.
 
     Source: Abdolmaleki et al. 2016, Eq. 18 (its last term).
     """

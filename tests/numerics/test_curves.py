@@ -39,5 +39,5 @@ def test_smooth_step_is_the_bezier_curve_of_doubled_ends():
 
 
 def test_bezier_without_points_is_an_error():
-    with pytest.raises(ValueError, match=r"one control point or more, got shape \(0, 2\)"):
+    with pytest.raises(ValueError, match=r"control_points must be at least one point, got shape \(0, 2\)"):
         bezier(jnp.zeros((0, 2)), jnp.float32(0.5))
