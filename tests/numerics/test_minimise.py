@@ -131,7 +131,7 @@ def test_vmap_equals_loop_and_is_traced_once():
 
 def test_bad_settings_are_named():
     unchecked = inspect.unwrap(minimise)
-    with pytest.raises(ValueError, match=r"got shape \(2, 2\)"):
+    with pytest.raises(ValueError, match=r"start must have shape \(k,\), k >= 1, got \(2, 2\)"):
         unchecked(jnp.sum, jnp.zeros((2, 2)))
     with pytest.raises(ValueError, match="max_steps must be at least 1, got 0"):
         minimise(jnp.sum, jnp.zeros(2), max_steps=0)

@@ -1,6 +1,6 @@
-"""Learn on a real robot, trial by trial: a search that is kept in a folder, whole at any moment.
+"""Learn on a real robot, trial by trial: a search that is kept in a folder, which is always consistent.
 
-Nothing heavy is imported before it is needed: to tell a reward takes no jax.
+jax starts only when it is needed: to tell a reward takes no jax, unless the trial completes a batch.
 """
 
 from creps_jax.tools.session.robot_session import RobotSession, Status, Told

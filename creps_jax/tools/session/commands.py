@@ -18,7 +18,7 @@ from creps_jax.tools.session.trials import Trial
 from creps_jax.tools.tables import to_markdown
 
 _COLUMNS = 6
-"""Trials side by side: as many as a terminal has room for."""
+"""Number of trials side by side that fit into a terminal."""
 
 _Folder = Annotated[Path, arg(metavar="FOLDER")]
 _Id = Annotated[int, arg(metavar="ID")]
@@ -35,10 +35,11 @@ class New:
     Attributes:
         folder: The new folder.
         policy: Policy file to begin with, a simulated one for example.
-        define: JSON file that says what the contexts and the parameters are.
+        define: JSON file that defines the contexts and the parameters.
         exploration: Factor of the policy's standard deviations; 1 by default.
-        batch_size: Trials that make an update; 10 by default.
-        archive_size: Last trials that are learned from; five batches by default, or more if that is too few.
+        batch_size: Number of trials for an update; 10 by default.
+        archive_size: Number of last trials to learn from; by default five batches, and at least twice the
+            number of features and parameters.
         kl_bound: Bound on the relative entropy of the weights of trials, in nats; 0.5 by default.
         seed: Seed of contexts and exploration; 0 by default.
     """
@@ -59,8 +60,8 @@ class Ask:
 
     Attributes:
         folder: The session.
-        context: A number for each context variable; by default each new trial gets its own from the range.
-        more: Number of new trials to ask for, though others are pending.
+        context: A number for each context variable; by default each new trial draws its own from the range.
+        more: Number of new trials to ask for while others are pending.
     """
 
     folder: Positional[_Folder]
@@ -77,8 +78,8 @@ class Tell:
         trial: The trial's number.
         reward: Its reward: the higher, the better.
         broken: The measurement failed: nothing is learned from the trial.
-        repeat: The trial was not valid and is run again with the same parameters: it stays pending.
-        replace: Change what was told before, as long as the batch is not complete.
+        repeat: The trial was not valid: run it again with the same parameters; it stays pending.
+        replace: Change an earlier result; possible until the batch is complete.
     """
 
     folder: Positional[_Folder]
@@ -91,7 +92,7 @@ class Tell:
 
 @dataclasses.dataclass(frozen=True)
 class Status:
-    """Show where a session stands, and draw it to status.md and status.png.
+    """Show the state of a session, and write it to status.md and status.png.
 
     Attributes:
         folder: The session.
@@ -102,7 +103,7 @@ class Status:
 
 @dataclasses.dataclass(frozen=True)
 class Save:
-    """Save the current policy as other commands read it.
+    """Save the current policy to a file for other commands.
 
     Attributes:
         folder: The session.
@@ -130,7 +131,7 @@ class SessionCommand:
 
 
 def run(command: SessionCommand, *, say: Callable[[str], None]) -> None:
-    """Do what a command asks for.
+    """Run a command.
 
     Raises:
         UserError: for a mistake, or a folder that cannot be read or written.
@@ -161,12 +162,12 @@ def _new(command: New, say: Callable[[str], None]) -> None:
     say(f"session: {command.folder}")
     say(f"contexts: {_list(settings.contexts)}")
     say(f"parameters: {_list(settings.parameters)}")
-    say(f"an update takes {settings.batch_size} trials; the last {settings.archive_size} are learned from")
+    say(f"an update takes {settings.batch_size} trials and learns from the last {settings.archive_size}")
     from creps_jax.tools.session.start import feature_map
 
     least = feature_map(settings).size + len(settings.parameters)
     if least > settings.batch_size:
-        say(f"the first update needs {least} valid trials: more than one batch")
+        say(f"the first update needs {least} valid trials, more than one batch")
     say(f"next: creps-jax session ask {command.folder}")
 
 
@@ -216,10 +217,10 @@ def _tell(command: Tell, say: Callable[[str], None]) -> None:
         say(
             f"the batch is complete: the policy moved by {update.kl:.3f} nats (KL), its entropy is now "
             f"{update.entropy:.2f}; {update.effective_samples:.1f} of {update.num_valid} trials effective; "
-            f"p = {update.p_value:.2g}: the smaller, the clearer do rewards depend on the parameters"
+            f"p = {update.p_value:.2g}: the smaller, the clearer is that rewards depend on the parameters"
         )
     elif not update.is_informative and update.num_valid >= sum(update.policy.coef.shape):
-        say("the batch is complete, but its rewards tell nothing that the context does not: the policy stays")
+        say("the batch is complete, but the context alone explains its rewards: the policy stays")
     else:
         say(
             f"the batch is complete, but {update.num_valid} valid trials are too few for a first update: it "

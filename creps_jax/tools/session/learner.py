@@ -1,6 +1,6 @@
-"""Learn from the trials of a session: the same settings and results lead to the same policy.
+"""Learn from the trials of a session: equal settings and results give the same policy.
 
-Bit by bit, if it is the same software, set up the same way; otherwise but for rounding.
+With the same software and set-up they are equal to the bit, otherwise up to rounding.
 """
 
 import functools
@@ -27,11 +27,11 @@ from creps_jax.tools.session.start import complete, feature_map, first_policy, s
 from creps_jax.tools.session.trials import Trial
 
 _GRID = 1000
-"""About how many contexts policies are compared at."""
+"""Approximate number of contexts at which policies are compared."""
 
 
 class Update(NamedTuple):
-    """What a batch has done to the policy."""
+    """The change of the policy by a batch."""
 
     policy: LinearGaussian
     kl: float
@@ -39,25 +39,25 @@ class Update(NamedTuple):
     kl_from_first: float
     """KL(policy || first policy) in nats, the mean over a grid of contexts."""
     entropy: float
-    """Of the policy where it is searched, in nats."""
+    """Of the distribution of free parameters, in nats."""
     effective_samples: float
     num_valid: int
-    """Trials that it was learned from."""
+    """Number of valid trials that it learned from."""
     is_updated: bool
-    """False where the policy was kept: there were too few valid trials, or rewards did not differ."""
+    """False if the policy was kept: there were too few valid trials, or rewards did not differ."""
     is_informative: bool
     """Whether rewards differ by more than the context explains."""
     p_value: float
-    """How likely chance alone would relate rewards to parameters as strongly, see `CrepsInfo`."""
+    """Probability that chance alone relates rewards to parameters as strongly, see `CrepsInfo`."""
     unsupported_loss: float
-    """Entropy that this update took by chance, in nats."""
+    """Entropy that this update lost by chance, in nats."""
 
 
 class Learner:
-    """What a session has learned from its batches, a pure function of settings and trials.
+    """The search of a session and its updates, a pure function of settings and trials.
 
     Raises:
-        UserError: if the settings do not make a learner.
+        UserError: if the search refuses the settings.
     """
 
     def __init__(self, settings: Settings):
@@ -72,7 +72,7 @@ class Learner:
         return self._state.policy
 
     def learn(self, batches: Sequence[Sequence[Trial]]) -> None:
-        """Learn from these batches; of those that were learned from before only new ones take time."""
+        """Learn from these batches; only those that are new since the last call take time."""
         if self._batches != list(batches[: len(self._batches)]):
             self._restart()
         for batch in batches[len(self._batches) :]:
@@ -95,7 +95,7 @@ class Learner:
             self._batches.append(list(batch))
 
     def propose(self, trial_id: int, context: Sequence[float] | None = None) -> Trial:
-        """Draw the parameters of a trial, and its context unless that is given."""
+        """Draw the parameters of a trial, and its context unless one is given."""
         settings = self.settings
         if context is None:
             rng = np.random.default_rng([settings.seed, trial_id])
@@ -113,7 +113,7 @@ class Learner:
 
     @property
     def contexts(self) -> np.ndarray:
-        """The contexts (n, s) that policies are compared at."""
+        """The contexts (n, s) at which policies are compared."""
         return np.asarray(self._programs.grid)
 
     def mean_parameters(self, policy: LinearGaussian) -> np.ndarray:
@@ -121,7 +121,7 @@ class Learner:
         return np.asarray(self._programs.means(policy))
 
     def learned(self) -> Learned:
-        """Return the current policy as other tools take it."""
+        """Return the current policy for other tools."""
         settings = self.settings
         return Learned(
             self.policy,
@@ -141,7 +141,7 @@ class Learner:
 
 
 class _Programs(NamedTuple):
-    """What is compiled once for all sessions of the same settings."""
+    """Programs that are compiled once for all sessions of the same settings."""
 
     algorithm: Creps
     tell: Callable[..., Any]
@@ -175,7 +175,7 @@ def _programs(settings: Settings) -> _Programs:
         key = jax.random.fold_in(jax.random.key(seed), trial)
         theta = algorithm.ask(key, state, context[None])[0]
         parameters = inside(theta)
-        # What is cut off was never tried, and nothing is to be learned of it.
+        # The part that clipping cuts off was not tried: the search learns from the clipped numbers.
         return (theta if settings.constraint == SIGMOID else parameters), parameters
 
     def distance(policy: LinearGaussian, reference: LinearGaussian) -> jax.Array:
@@ -193,7 +193,7 @@ def _programs(settings: Settings) -> _Programs:
 
 
 def _within(values: Sequence[float], variables: Sequence[Context]) -> list[float]:
-    """Take back what rounding has put outside of the ranges."""
+    """Move numbers that rounding has put outside of the ranges back into them."""
     return [min(max(value, each.low), each.high) for value, each in zip(values, variables, strict=True)]
 
 
@@ -204,6 +204,6 @@ def _as_batch(trials: Sequence[Trial]) -> Batch:
         [trial.theta for trial in trials],
         rewards,
     )
-    # In float64, so that rewards keep their differences beside an offset.
+    # In float64 rewards with a large offset keep their differences.
     wide: Any = [np.array(column, np.float64) for column in columns]
     return Batch(*wide)

@@ -1,4 +1,4 @@
-"""Show where a session stands: in a few lines, in a table of its batches, and on a page with a figure."""
+"""Show the state of a session: in a few lines, in a table of its batches, and on a page with a figure."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,11 +19,11 @@ _BEFORE, _NOW = plots.PAPER_COLOUR, plots.COLOURS[0]
 _MAX_COLUMNS = 5
 
 _MUCH_LOST = 0.5
-"""Entropy of a parameter lost by chance, in nats, and its share of all that is lost, from which on the page
-warns of it."""
+"""The page warns if more than this entropy, in nats for each parameter, and more than this share of the total
+loss, was lost by chance."""
 
 _MANY_UPDATES, _CHANCE = 5, 0.1
-"""Updates in a row whose p-values are all above this one, from which on the page warns of it."""
+"""The page warns if this number of successive updates all have p-values above this one."""
 
 
 def save_page(folder: Path, status: Status) -> None:
@@ -35,7 +35,7 @@ def save_page(folder: Path, status: Status) -> None:
 
 
 def summary(status: Status) -> list[str]:
-    """Count the trials, and say how far the policy has come."""
+    """Return lines on the trials, and on the change of the policy since the first one."""
     told, size = status.record.told(), status.settings.batch_size
     broken = sum(trial.is_broken for trial in told)
     repeats = sum(trial.repeats for trial in status.record.trials)
@@ -60,7 +60,7 @@ def summary(status: Status) -> list[str]:
 
 
 def _warnings(status: Status) -> list[str]:
-    """Warn of a search that goes by chance."""
+    """Return warnings of a search that follows chance."""
     updates, lines = status.updates, []
     lost = sum(update.unsupported_loss for update in updates)
     all_lost = updates[0].entropy - updates[-1].entropy
@@ -79,7 +79,7 @@ def _warnings(status: Status) -> list[str]:
 
 
 def table(status: Status) -> str:
-    """Return the table of the batches; one that is not complete has changed nothing yet."""
+    """Return the table of the batches; the last one may not be complete, and has no update then."""
     told, size = status.record.told(), status.settings.batch_size
     columns: dict[str, list[object]] = {
         name: []
@@ -107,7 +107,7 @@ def table(status: Status) -> str:
 
 
 def draw(status: Status) -> Figure:
-    """Draw rewards in the order of telling, how far updates moved, and parameters against a context alone."""
+    """Draw rewards in the order of telling, the KL of updates, and parameters against a single context."""
     variables = status.settings.parameters if len(status.settings.contexts) == 1 else ()
     columns = max(2, min(_MAX_COLUMNS, len(variables)))
     rows = 1 + -(-len(variables) // columns)
@@ -145,7 +145,7 @@ def _draw_rewards(axes: Axes, told: Sequence[Trial], size: int) -> None:
             axes.plot(ends, [means[-1]] * 2, color=plots.COLOURS[1], label=label)
     is_broken = ~np.isfinite(rewards)
     if is_broken.any():
-        # They have no reward: they stand at the foot of the axes.
+        # They have no reward: draw them at the bottom of the axes.
         foot = np.full(is_broken.sum(), 0.03)
         axes.plot(
             place[is_broken], foot, "x", color="black", transform=axes.get_xaxis_transform(), label="broken"
@@ -158,7 +158,7 @@ def _draw_rewards(axes: Axes, told: Sequence[Trial], size: int) -> None:
 
 
 def _scale(axes: Axes, rewards: np.ndarray, means: np.ndarray) -> None:
-    """Scale rewards by the means of the batches: a logarithm of single ones would show luck above all."""
+    """Scale rewards by the means of the batches: a logarithm of single rewards shows mostly noise."""
     if np.nanmax(rewards, initial=-np.inf) <= 0:
         plots.reward_scale(axes, [means])
         if axes.get_yscale() != "linear":
@@ -180,7 +180,7 @@ def _draw_updates(axes: Axes, status: Status) -> None:
     axes.set(xlabel="batch", ylabel="KL (nats)", title="moves of the policy")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if updates:
-        # Room for the legend, which stands where the first updates are.
+        # Room for the legend, above the first updates.
         axes.set_ylim(0.0, 1.5 * max(max(update.kl, update.kl_from_first) for update in updates) + 1e-9)
         axes.legend(loc="upper left", fontsize=8)
 

@@ -1,4 +1,4 @@
-"""Read dataclasses from plain JSON values, with one clear error for each mistake; write JSON for people."""
+"""Read dataclasses from plain JSON values, with a clear error for each mistake; write readable JSON."""
 
 import dataclasses
 import json
@@ -12,20 +12,20 @@ import numpy as np
 from creps_jax.errors import UserError, suggest
 
 _LARGEST = float(np.finfo(np.float32).max)
-"""Numbers go to the learner, which computes in single precision."""
+"""The learner computes in single precision."""
 _WIDTH = 110
 
 T = TypeVar("T")
 
 
 def read(kind: type[T], values: Any, name: object) -> T:
-    """Make a dataclass of plain values, as JSON has them.
+    """Make a dataclass from plain values, as in JSON.
 
     Args:
         kind: a dataclass whose fields are numbers, text, tuples, dicts or other such dataclasses, or unions
             of one of these with a tuple or None.
         values: a dict of its fields.
-        name: where they come from, for errors.
+        name: the source of the values, for errors.
 
     Raises:
         UserError: if a field is unknown, missing or of a wrong kind, or if the dataclass refuses it.
@@ -37,7 +37,7 @@ def read(kind: type[T], values: Any, name: object) -> T:
 
 
 def to_text(values: Any, indent: str = "") -> str:
-    """Write values as JSON: what fits into a line, and each row of numbers, in one line."""
+    """Write values as JSON: each row of numbers, and everything that fits, in one line."""
     line = json.dumps(values, ensure_ascii=False)
     nested = (dict, list, tuple)
     is_row = isinstance(values, list | tuple) and not any(isinstance(value, nested) for value in values)
@@ -53,7 +53,7 @@ def to_text(values: Any, indent: str = "") -> str:
 
 
 def shortest(values: Any) -> list[float]:
-    """Return the shortest decimals that single precision reads as these numbers."""
+    """Return the shortest decimals that are read back as these numbers in single precision."""
     return [float(str(value)) for value in np.asarray(values, np.float32)]
 
 
@@ -106,8 +106,8 @@ def _value(kind: Any, value: Any, place: str) -> Any:
 
 
 def is_number(value: Any) -> bool:
-    """Tell whether a value is a number that is finite in single precision."""
-    # Comparing tells NaN and whole numbers of any length, too.
+    """Return whether a value is a number that is finite in single precision."""
+    # The comparison is also false for NaN, and takes whole numbers of any length.
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST
 
 

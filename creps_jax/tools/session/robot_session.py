@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from creps_jax.tools.session.learner import Learner, Update
 
 LOCK_SECONDS = 30.0
-"""How long to wait for another process that uses the folder."""
+"""Time to wait for another process that uses the folder."""
 
 
 class Told(NamedTuple):
-    """What came of telling.
+    """The result of `RobotSession.tell`.
 
     Attributes:
-        trial: the trial as it is now.
-        is_new: False if all this was known already, and nothing changed.
-        update: what the policy has learned, if this trial made a batch complete.
+        trial: the trial with its result.
+        is_new: False if the result was known already, and nothing changed.
+        update: the update of the policy, if this trial completed a batch.
     """
 
     trial: Trial
@@ -37,13 +37,13 @@ class Told(NamedTuple):
 
 
 class Status(NamedTuple):
-    """Where a session stands.
+    """The state of a session.
 
     Attributes:
         settings: its settings.
         record: its trials.
-        updates: what each whole batch has done to the policy.
-        least_trials: trials that an update needs, broken ones not counted.
+        updates: the update by each complete batch.
+        least_trials: number of trials that an update needs, without broken ones.
         contexts: (n, s) a grid over the range.
         first_parameters: (n, d) mean parameters of the first policy there.
         parameters: (n, d) mean parameters of the current policy.
@@ -59,10 +59,10 @@ class Status(NamedTuple):
 
 
 class RobotSession:
-    """A search that is kept in a folder; any number of these, in any process, may use one folder.
+    """A search that is kept in a folder; any number of instances, in any process, may use one folder.
 
-    What has been told is on the disk before `tell` returns. What has been learned follows from it, and is
-    never saved. Use `RobotSession.create` or `RobotSession.open`.
+    Results are on the disk before `tell` returns. The policy is not saved: it is computed from the results.
+    Use `RobotSession.create` or `RobotSession.open`.
     """
 
     def __init__(self, folder: Path, settings: Settings, *, on_learning: Callable[[int], None] | None = None):
@@ -84,11 +84,11 @@ class RobotSession:
         """Begin a session in a new folder, from a policy or from a definition.
 
         Args:
-            folder: where; it must not be there yet.
+            folder: the new folder; it must not exist.
             policy: a saved policy to begin with, or its file.
             define: the fields of `Settings`, or a JSON file of them.
             exploration: factor of the policy's standard deviations, 1 by default.
-            changes: fields of `Settings` that differ from these.
+            changes: fields of `Settings` that replace those of the policy or the definition.
 
         Raises:
             UserError: for a mistake in the settings, or a folder that cannot be made.
@@ -129,24 +129,24 @@ class RobotSession:
         return session
 
     def pending(self) -> list[Trial]:
-        """Return the trials that were asked for and not told yet."""
+        """Return the trials that have no result yet."""
         return self._record().pending()
 
     def ask(self, context: Sequence[float] | None = None, *, more: int | None = None) -> list[Trial]:
-        """Return the pending trials; if there are none, or if `more` are wanted, ask for new ones first.
+        """Return the pending trials; if there are none, or if `more` is given, ask for new ones first.
 
         Args:
-            context: a number for each context variable, for all new trials; by default each gets its own,
-                drawn evenly from the range.
-            more: how many new trials, pending ones or not. By default, if none is pending, one for a given
-                context, or else as many as the batch lacks.
+            context: a number for each context variable, for all new trials; by default each draws its own
+                uniformly from the range.
+            more: number of new trials, whether others are pending or not. By default there are new trials
+                only if none is pending: one for a given context, else enough to complete the batch.
 
         Returns:
             All pending trials, new ones last.
 
         Raises:
-            UserError: if a context is given and other contexts are pending, if it is none of this session's,
-                or if the folder cannot be written.
+            UserError: if a context is given and trials of other contexts are pending, if it is not within the
+                ranges, or if the folder cannot be written.
         """
         if context is not None:
             context = self.settings.checked_context(context)
@@ -167,16 +167,16 @@ class RobotSession:
         return record.pending()
 
     def tell(self, trial_id: int, reward: float, *, replace: bool = False) -> Told:
-        """Tell the reward of a trial; the policy is updated when this makes a batch complete.
+        """Tell the reward of a trial; if this completes a batch, the policy is updated.
 
         Args:
-            trial_id: which trial.
-            reward: the higher, the better; NaN is a measurement that failed, which is never learned from.
-            replace: whether another result may be changed, as long as the trial's batch is not complete.
+            trial_id: number of the trial.
+            reward: the higher, the better; NaN is a measurement that failed: nothing is learned from it.
+            replace: whether an earlier result may be changed; possible until the trial's batch is complete.
 
         Raises:
-            UserError: if there is no such trial, it has another result, the reward is infinite, or the folder
-                cannot be written.
+            UserError: if the trial does not exist or has another result, the reward is infinite, or the
+                folder cannot be written.
         """
         size = self.settings.batch_size
         with storage.locked(self.folder, wait=LOCK_SECONDS):
@@ -188,14 +188,14 @@ class RobotSession:
         return Told(record.trial(trial_id), record != before, update)
 
     def repeat(self, trial_id: int, *, replace: bool = False) -> Trial:
-        """Send a trial that was not valid back to be run again, with the same parameters: it is pending.
+        """Make a trial that was not valid pending again, to be run with the same parameters.
 
         Args:
-            trial_id: which trial.
-            replace: whether a result that it has may be dropped, as long as its batch is not complete.
+            trial_id: number of the trial.
+            replace: whether its result may be dropped; possible until its batch is complete.
 
         Raises:
-            UserError: if there is no such trial, it has a result, or the folder cannot be written.
+            UserError: if the trial does not exist or has a result, or the folder cannot be written.
         """
         with storage.locked(self.folder, wait=LOCK_SECONDS):
             before = self._record()
@@ -204,7 +204,7 @@ class RobotSession:
         return record.trial(trial_id)
 
     def status(self) -> Status:
-        """Return where the session stands; `creps_jax.tools.session.page` draws it."""
+        """Return the state of the session; `creps_jax.tools.session.page` draws it."""
         record = self._record()
         learner = self._learned(record)
         return Status(
@@ -228,7 +228,7 @@ class RobotSession:
         if record != before:
             storage.save_record(self.folder, record)
         else:
-            # What is known was perhaps written by a process that died before it was sure of its disk.
+            # Another process may have written the result and ended before the folder was synced.
             files.sync_folder(self.folder)
 
     def _learned(self, record: Record) -> "Learner":

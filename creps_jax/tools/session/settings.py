@@ -1,4 +1,4 @@
-"""Say what a session is about: the contexts, the parameters and how to learn; written as plain JSON."""
+"""Settings of a session: the contexts, the parameters and how to learn; written as plain JSON."""
 
 import dataclasses
 import hashlib
@@ -79,23 +79,24 @@ class FirstPolicy:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
-    """All that decides what a session learns, but for the trials.
+    """All settings on which learning depends.
 
     Attributes:
-        contexts: what the policy is told.
-        parameters: what the policy decides.
+        contexts: the inputs of the policy.
+        parameters: the outputs of the policy.
         features: of the context; the policy's mean is linear in them.
-        constraint: how parameters are kept in their bounds: "sigmoid" searches numbers that are squashed into
-            them, "clip" cuts off what is drawn outside, and learns from what is left.
+        constraint: how parameters are kept within their bounds: "sigmoid" squashes free numbers into them,
+            "clip" clips the numbers that are drawn, and learns from the clipped ones.
         kl_bound: epsilon, bound on the relative entropy of the weights of samples, nats.
-        mean_kl_bound: bound on the change of the policy's mean in an update, nats, see `bounded_ml`; with
-            `cov_kl_bound` None it is not bounded, as in the paper.
+        mean_kl_bound: bound on the change of the policy's mean in an update, nats, see `bounded_ml`; None for
+            this and `cov_kl_bound` is the paper's fit without bounds.
         cov_kl_bound: the same for the covariance, nats.
-        batch_size: trials that make an update.
-        archive_size: last trials that are learned from; five batches by default, or more if that is too few.
+        batch_size: number of trials for an update.
+        archive_size: number of last trials to learn from; by default five batches, and at least twice the
+            number of features and parameters.
         seed: of the contexts and of the exploration.
-        first_policy: what to begin with, in place of start and spread of the parameters.
-        task: what a saved policy says of its task; nothing here depends on it.
+        first_policy: the first policy, in place of start and spread of the parameters.
+        task: the task of a saved policy; learning does not depend on it.
     """
 
     contexts: tuple[Context, ...]
@@ -109,7 +110,7 @@ class Settings:
     archive_size: int | None = None
     seed: int = 0
     first_policy: FirstPolicy | None = None
-    # Two settings that differ in it alone are not equal, but may share a hash.
+    # Settings that differ only in the task are not equal, but may have one hash.
     task: dict[str, Any] = dataclasses.field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
@@ -138,7 +139,7 @@ class Settings:
         """Return a context.
 
         Raises:
-            UserError: if it has not a number for each variable, within its range.
+            UserError: if there is not a number for each variable, or one is out of its range.
         """
         if len(context) != len(self.contexts):
             names = ", ".join(self.context_names)
@@ -149,13 +150,13 @@ class Settings:
         return [float(value) for value in context]
 
     def digest(self) -> str:
-        """Return a short text that other settings do not have."""
+        """Return a short text that differs from the text of other settings."""
         text = json.dumps(dataclasses.asdict(self), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def load_settings(path: Path) -> Settings:
-    """Read settings, or a definition that leaves out what has a default.
+    """Read settings, or a definition without the settings that have defaults.
 
     Raises:
         UserError: for the first mistake in the file.

@@ -1,4 +1,4 @@
-"""Say where a session begins: with a saved policy, or with the start and the spread of each parameter."""
+"""The beginning of a session: a saved policy, or the start and the spread of each parameter."""
 
 import dataclasses
 import math
@@ -25,11 +25,12 @@ def settings_from_policy(learned: Learned, *, exploration: float = 1.0) -> Setti
     """Return settings that begin with a policy.
 
     Args:
-        learned: the policy; one that was learned without a sigmoid is kept in its bounds by clipping.
+        learned: the policy; without a sigmoid, its parameters are clipped to their bounds.
         exploration: factor of its standard deviations.
 
     Raises:
-        UserError: if that is not positive and finite, or the settings of a session cannot name the features.
+        UserError: if the factor is not positive and finite, or settings of a session cannot describe the
+            features.
     """
     if not (exploration > 0 and math.isfinite(exploration)):
         raise UserError(f"exploration must be above zero and finite, got {exploration}")
@@ -67,10 +68,10 @@ def _settings_of_features(learned: Learned) -> Features:
 
 
 def complete(settings: Settings) -> Settings:
-    """Fill in what a definition may leave open: features, where the search begins, how many trials are kept.
+    """Fill in the defaults of a definition: features, start and spread of parameters, size of the archive.
 
     Raises:
-        UserError: if there are no such features.
+        UserError: if the settings of the features are out of their ranges.
     """
     settings = dataclasses.replace(settings, features=settings.features.complete(len(settings.contexts)))
     if settings.archive_size is None:
@@ -91,10 +92,10 @@ def complete(settings: Settings) -> Settings:
 
 
 def first_policy(settings: Settings) -> LinearGaussian:
-    """Return the policy that a session begins with, where it is searched.
+    """Return the first policy of a session, a distribution of free parameters.
 
     Raises:
-        UserError: if its arrays do not fit the settings, or are no Gaussian's in single precision.
+        UserError: if its arrays do not fit the settings, or do not make a Gaussian in single precision.
     """
     given = settings.first_policy
     coef, cov_chol = _start(settings) if given is None else (given.coef, given.cov_chol)
@@ -125,7 +126,7 @@ def _start(settings: Settings) -> tuple[np.ndarray, np.ndarray]:
     columns = [(each.start, each.spread, each.low, each.high) for each in settings.parameters]
     start, spread, low, high = np.array(columns, float).T
     if settings.constraint == SIGMOID:
-        # The slope of the sigmoid makes the spread, to first order, that of the parameters.
+        # To first order, the slope of the sigmoid converts the spread of the parameters.
         share = (start - low) / (high - low)
         start, spread = np.log(share / (1 - share)), spread / ((high - low) * share * (1 - share))
     try:
@@ -139,7 +140,7 @@ def feature_map(settings: Settings) -> FeatureMap:
     """Return the features of the context.
 
     Raises:
-        UserError: if there are no such features.
+        UserError: if their settings are out of their ranges.
     """
     try:
         return settings.features.make(*ends(settings.contexts))
@@ -148,7 +149,7 @@ def feature_map(settings: Settings) -> FeatureMap:
 
 
 def space_of(variables: Sequence[Context], constraint: str = CLIP) -> Space:
-    """Return the variables of a session as a policy describes them."""
+    """Return the variables of a session as the `Space` of a policy."""
     low, high = ends(variables)
     return Space(
         tuple(each.name for each in variables), low, high, tuple(each.unit for each in variables), constraint

@@ -1,4 +1,4 @@
-"""Keep a session in a folder that is whole at any moment, used by one process at a time."""
+"""Keep a session in a folder that is always consistent, and is used by one process at a time."""
 
 import contextlib
 import dataclasses
@@ -19,10 +19,10 @@ TRIALS = "trials.json"
 
 
 def create(folder: Path, settings: Settings) -> None:
-    """Make the folder of a new session: all of it, or nothing.
+    """Make the folder of a new session: completely, or not at all.
 
     Raises:
-        UserError: if the folder is there already, or cannot be written.
+        UserError: if the folder exists already, or cannot be written.
     """
     if folder.exists():
         raise UserError(f"{folder} is there already, name a new folder")
@@ -48,7 +48,7 @@ def open_settings(folder: Path) -> Settings:
     """Read the settings of a session.
 
     Raises:
-        UserError: if the folder holds none.
+        UserError: if the folder holds no session.
     """
     if not (folder / SETTINGS).exists():
         raise UserError(f"{folder} holds no robot session: it has no {SETTINGS} (session new makes one)")
@@ -56,10 +56,10 @@ def open_settings(folder: Path) -> Settings:
 
 
 def load_record(folder: Path, settings: Settings) -> Record:
-    """Read the trials of a session; the file is left as it is, whatever comes.
+    """Read the trials of a session; the file is never changed.
 
     Raises:
-        UserError: if it is missing, cut short, foreign, or was written with other settings.
+        UserError: if the file is missing, cut short, foreign, or was written with other settings.
     """
     path = folder / TRIALS
     values = files.load_json(path)
@@ -67,7 +67,7 @@ def load_record(folder: Path, settings: Settings) -> Record:
         raise UserError(f"{path} holds no trials of a robot session (its format is not {FORMAT!r})")
     record = plain.read(Record, values, path)
     if not record.trials:
-        # Until the first trial settings may be edited by hand.
+        # Until the first trial, users may edit the settings.
         return dataclasses.replace(record, settings=settings.digest())
     if record.settings != settings.digest():
         raise UserError(
@@ -85,26 +85,26 @@ def save_record(folder: Path, record: Record) -> None:
     """Write the trials of a session, atomically.
 
     Raises:
-        UserError: if they cannot be written; those that were there stay.
+        UserError: if they cannot be written; the file then stays unchanged.
     """
     files.save_text(folder / TRIALS, plain.to_text(dataclasses.asdict(record)) + "\n")
 
 
 @contextlib.contextmanager
 def locked(folder: Path, *, wait: float) -> Iterator[None]:
-    """Keep other processes from changing a session meanwhile.
+    """Keep other processes from changing a session.
 
     Args:
-        folder: that of the session.
-        wait: seconds to wait for others.
+        folder: the folder of the session.
+        wait: seconds to wait for other processes.
 
     Raises:
-        UserError: if another process is still at it then, or the folder cannot be locked.
+        UserError: if another process still uses the folder after this time, or it cannot be locked.
     """
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(folder_lock.locked(folder, wait=wait))
-            # A process that was killed while it wrote leaves what nobody reads.
+            # Files of processes that were killed while they wrote.
             for leftover in folder.glob(f".{TRIALS}.*.part"):
                 leftover.unlink(missing_ok=True)
         except OSError as error:

@@ -1,4 +1,4 @@
-"""Trials of a session: those asked for, and their results."""
+"""Trials of a session and their results."""
 
 import dataclasses
 import math
@@ -17,11 +17,11 @@ class Trial:
     Attributes:
         id: a running number from 1.
         context: by name.
-        parameters: what to run the robot with, by name, within their bounds.
-        theta: the same where they are searched, see `Settings.constraint`.
-        told: its place in the order of telling, from 1; None as long as it is pending.
-        reward: None of a trial that has been told is a measurement that failed.
-        repeats: how often it was sent back to be run again.
+        parameters: the parameters to run the robot with, by name, within their bounds.
+        theta: the free parameters that the search learns from, see `Settings.constraint`.
+        told: place in the order of telling, from 1; None if the trial is pending.
+        reward: None for a trial that has been told is a measurement that failed.
+        repeats: number of times that it was sent back to be run again.
     """
 
     id: int
@@ -48,7 +48,7 @@ class Trial:
 
     @property
     def result(self) -> str:
-        """What came of it, in words."""
+        """The result in words."""
         if self.is_pending:
             return "pending"
         return "broken" if self.reward is None else f"reward {self.reward}"
@@ -56,10 +56,10 @@ class Trial:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Record:
-    """All trials of a session, never changed in place: with the settings they decide what has been learned.
+    """All trials of a session, never changed in place; with the settings they determine the policy.
 
     Attributes:
-        format: names this kind of file.
+        format: the name of the file format.
         settings: digest of the settings that the trials were asked for with.
         trials: by id.
     """
@@ -85,7 +85,7 @@ class Record:
         return [by_place[place] for place in sorted(by_place)]
 
     def batches(self, size: int) -> list[list[Trial]]:
-        """Return the trials that have been learned from: those told, in whole batches."""
+        """Return the trials that have been learned from: the complete batches of those told."""
         told = self.told()
         return [told[first : first + size] for first in range(0, len(told) - size + 1, size)]
 
@@ -108,14 +108,14 @@ class Record:
         """Add the result of a trial; one that is known already changes nothing.
 
         Args:
-            trial_id: which one.
+            trial_id: number of the trial.
             reward: NaN is a measurement that failed.
-            batch_size: trials that make an update.
-            replace: whether another result may be in its place.
+            batch_size: number of trials for an update.
+            replace: whether an earlier result may be replaced.
 
         Raises:
-            UserError: if there is no such trial, the reward is no finite number, or there is another result
-                that is not to be, or can no longer be, replaced.
+            UserError: if the trial does not exist, the reward is infinite, or the trial has another result
+                that may not, or can no longer, be replaced.
         """
         trial = self.trial(trial_id)
         try:
@@ -136,10 +136,10 @@ class Record:
         return self._with(result)
 
     def with_repeat(self, trial_id: int, *, batch_size: int, replace: bool) -> "Record":
-        """Send a trial back to be run again with the same parameters: it is pending, whatever it was.
+        """Make a trial pending again, to be run with the same parameters.
 
         Raises:
-            UserError: if there is no such trial, or it has a result that is not to be, or can no longer be,
+            UserError: if the trial does not exist, or has a result that may not, or can no longer, be
                 replaced.
         """
         trial = self.trial(trial_id)
