@@ -36,7 +36,7 @@ from creps_jax.tools.play import (
     record,
     save_film,
 )
-from creps_jax.tools.robots import WALKERS, Bounds, Walker, find_walker
+from creps_jax.tools.robots import ROBOTS, Bounds, RobotRanges, find_robot
 from creps_jax.training import evaluate
 from creps_jax.walking.params import (
     AUTHOR_BOUNDS,
@@ -50,7 +50,7 @@ from experiments.learning import Log, Plan, Session, learn, trial_keys
 from experiments.registry import Claim
 
 BOUNDS = {
-    **{name: walker.bounds for name, walker in WALKERS.items()},
+    **{name: ranges.bounds for name, ranges in ROBOTS.items()},
     "author": AUTHOR_BOUNDS,
     "paper": PAPER_BOUNDS,
 }
@@ -81,7 +81,7 @@ class Settings:
     width of the scripts that its author published; DEVIATIONS.md says what differs.
 
     Attributes:
-        robot: who learns to walk, a name in WALKERS.
+        robot: who learns to walk, a name in ROBOTS.
         iterations: iterations of learning.
         trials: trials, all learned at once.
         samples: new samples of an iteration, of each trial.
@@ -152,7 +152,7 @@ class Settings:
         # Settings that come back from a manifest are plain.
         if isinstance(self.features, Mapping):
             object.__setattr__(self, "features", Features(**self.features))
-        find_walker(self.robot)
+        find_robot(self.robot)
         choices = {"constraint": CONSTRAINTS, "sampler": SAMPLERS, "physics": PHYSICS}
         if self.bounds is not None:
             choices["bounds"] = BOUNDS
@@ -162,16 +162,16 @@ class Settings:
 
     def resolved(self) -> "Settings":
         """Return the settings with what None and "auto" stand for here and today, for a run to keep."""
-        walker = self.walker()
-        own = {"low": walker.low, "high": walker.high, "bounds": self.robot}
+        ranges = self.ranges()
+        own = {"low": ranges.low, "high": ranges.high, "bounds": self.robot}
         chosen: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name) is None}
         if self.physics == "auto":
             chosen["physics"] = _fastest_name()
         return dataclasses.replace(self, **chosen)
 
-    def walker(self) -> Walker:
-        """Return who learns to walk."""
-        return find_walker(self.robot)
+    def ranges(self) -> RobotRanges:
+        """Return the robot that learns to walk, with its ranges."""
+        return find_robot(self.robot)
 
     def box(self) -> Bounds:
         """Return the bounds of the parameters."""
@@ -193,10 +193,10 @@ class Settings:
     def context_range(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return the lowest and the highest value of each context variable."""
         conditions = self.conditions()
-        walker = self.walker()
+        ranges = self.ranges()
         low, high = (
             own if asked is None else asked
-            for asked, own in ((self.low, walker.low), (self.high, walker.high))
+            for asked, own in ((self.low, ranges.low), (self.high, ranges.high))
         )
         return (low, *(c.low for c in conditions)), (high, *(c.high for c in conditions))
 
@@ -354,7 +354,7 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
         balance=settings.balance(),
         physics=PHYSICS[settings.physics],
         conditions=settings.conditions(),
-        robot=settings.walker().robot,
+        robot=settings.ranges().robot,
     )
     if settings.constraint == PENALTY:
         return penalised(task, *settings.box(), PENALTY_SIZE)
@@ -503,7 +503,7 @@ def finish(
     files.save_text(folder / "table.md", tables.to_markdown(columns))
     say(f"\n{tables.to_markdown(columns)}")
     clips = record(policy, filmed_speeds(policy), seed=0, duration=settings.duration)
-    save_film(clips, folder / "walk.mp4", say, robot=settings.walker().robot)
+    save_film(clips, folder / "walk.mp4", say, robot=settings.ranges().robot)
 
 
 def param_titles() -> list[str]:

@@ -208,7 +208,7 @@ def finish(
     tables.save_table(table(arrays), folder, say)
     speeds, slopes = zip(*FILMED, strict=True)
     clips = record(policy, speeds, seed=0, duration=settings.duration, slopes=slopes)
-    save_film(clips, folder / "walk_slope.mp4", say, robot=settings.walker().robot)
+    save_film(clips, folder / "walk_slope.mp4", say, robot=settings.ranges().robot)
 
 
 def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[object]]:

@@ -17,7 +17,7 @@ from creps_jax.simulation import c
 from creps_jax.tasks.conditions import slope
 from creps_jax.tasks.walking import CONTROL_PERIOD, model_path, record_walk
 from creps_jax.tools import results
-from creps_jax.tools.robots import find_walker
+from creps_jax.tools.robots import find_robot
 from creps_jax.tools.video import Clip, VideoError, write_video
 from creps_jax.walking.params import PARAM_NAMES
 from creps_jax.walking.posture import Balance
@@ -142,7 +142,7 @@ def default_policy(robot: str | None = None) -> Path:
     Raises:
         UserError: if there is neither, or no such robot.
     """
-    robot = find_walker(robot or NAO.name).robot.name
+    robot = find_robot(robot or NAO.name).robot.name
     folder = results.latest_folder("walk", status="finished", robot=robot)
     if folder is not None and (folder / POLICY).exists():
         return folder / POLICY
@@ -155,7 +155,7 @@ def shipped_policy(robot: str | None = None) -> Path:
     Raises:
         UserError: if there is none, or no such robot.
     """
-    robot = find_walker(robot or NAO.name).robot.name
+    robot = find_robot(robot or NAO.name).robot.name
     shipped = sorted(policies_folder(robot).glob("*.npz"))
     if not shipped:
         asked = "" if robot == NAO.name else f" --robot {robot}"
@@ -192,7 +192,7 @@ def load_walking_policy(path: Path, robot: str | None = None) -> Learned:
         found = robot_of(policy).name
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    if robot is not None and find_walker(robot).robot.name != found:
+    if robot is not None and find_robot(robot).robot.name != found:
         raise UserError(f"{path} is a policy of the robot {found}, not of {robot}")
     return policy
 
@@ -203,7 +203,7 @@ def robot_of(policy: Learned) -> Robot:
     Raises:
         UserError: if it is unknown.
     """
-    return find_walker(str(policy.task.get("robot", NAO.name))).robot
+    return find_robot(str(policy.task.get("robot", NAO.name))).robot
 
 
 def balance_of(policy: Learned) -> Balance:

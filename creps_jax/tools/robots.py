@@ -1,4 +1,4 @@
-"""The robots that learn to walk, by name, each with what it can do."""
+"""The robots that the commands know, by name, each with the ranges in which it learns to walk."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -10,8 +10,8 @@ from creps_jax.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 
-class Walker(NamedTuple):
-    """A robot and the range in which it learns to walk.
+class RobotRanges(NamedTuple):
+    """A robot and the ranges of speeds and parameters in which it learns to walk.
 
     Attributes:
         robot: the robot.
@@ -26,18 +26,18 @@ class Walker(NamedTuple):
     bounds: Bounds
 
 
-WALKERS: Mapping[str, Walker] = {
-    walker.robot.name: walker
-    for walker in (Walker(NAO, 0.1, 0.6, NAO_BOUNDS), Walker(NAO_H25, 0.05, 0.3, NAO_H25_BOUNDS))
+ROBOTS: Mapping[str, RobotRanges] = {
+    ranges.robot.name: ranges
+    for ranges in (RobotRanges(NAO, 0.1, 0.6, NAO_BOUNDS), RobotRanges(NAO_H25, 0.05, 0.3, NAO_H25_BOUNDS))
 }
 
 
-def find_walker(name: str) -> Walker:
-    """Return the walker of a robot's name.
+def find_robot(name: str) -> RobotRanges:
+    """Return a robot and its ranges by the robot's name.
 
     Raises:
-        UserError: with the nearest name, and all of them, if there is none.
+        UserError: with the nearest name and all known names, if the name is unknown.
     """
-    if name not in WALKERS:
-        raise UserError(f"unknown robot {name!r}{suggest(name, WALKERS)}")
-    return WALKERS[name]
+    if name not in ROBOTS:
+        raise UserError(f"unknown robot {name!r}{suggest(name, ROBOTS)}")
+    return ROBOTS[name]

@@ -21,7 +21,7 @@ from creps_jax.tasks.walking import WalkOutcome, nao_walk
 from creps_jax.tools import play, results, tables
 from creps_jax.tools.cli import main as tools
 from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy
-from creps_jax.tools.robots import WALKERS
+from creps_jax.tools.robots import ROBOTS
 from creps_jax.tools.session.plain import read
 from creps_jax.tools.video import Clip, VideoError
 from creps_jax.training import evaluate
@@ -261,7 +261,7 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
     assert dataclasses.replace(settings, bounds="author").box() == AUTHOR_BOUNDS
     contexts = jax.vmap(walk.make_task(settings).sample_context)(jax.random.split(jax.random.key(0), 500))
     assert asked["robot"] is NAO_H25
-    low, high = WALKERS["nao_h25"].low, WALKERS["nao_h25"].high
+    low, high = ROBOTS["nao_h25"].low, ROBOTS["nao_h25"].high
     np.testing.assert_allclose([contexts.min(), contexts.max()], [low - 0.02, high + 0.02], atol=5e-3)
     np.testing.assert_allclose(settings.speeds()[[0, -1]], [low, high], rtol=1e-6)
     assert not tables.are_the_papers(settings.speeds())
@@ -308,11 +308,11 @@ def test_each_robot_has_its_latest_run(bench):
 
 
 def test_films_show_six_speeds_of_the_policys_range():
-    nao, h25 = (load_walking_policy(shipped_policy(robot)) for robot in WALKERS)
+    nao, h25 = (load_walking_policy(shipped_policy(robot)) for robot in ROBOTS)
     assert play.filmed_speeds(nao) == [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
-    walker = WALKERS["nao_h25"]
-    assert play.filmed_speeds(h25)[0] == walker.low
-    assert play.filmed_speeds(h25)[-1] == walker.high
+    ranges = ROBOTS["nao_h25"]
+    assert play.filmed_speeds(h25)[0] == ranges.low
+    assert play.filmed_speeds(h25)[-1] == ranges.high
 
 
 @pytest.mark.parametrize(
@@ -363,7 +363,7 @@ def unfinished(name, settings):
 def test_resume_finds_the_latest_unfinished_run_of_the_robot(bench):
     settings = {
         robot: dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"], robot=robot).resolved())
-        for robot in WALKERS
+        for robot in ROBOTS
     }
     others = unfinished("1", settings["nao_h25"])
     ours = unfinished("2", settings["nao"])
@@ -390,12 +390,12 @@ def test_a_run_from_before_robots_can_be_resumed(bench, physics):
     assert resumed.physics == physics and resumed.robot == "nao"
 
 
-@pytest.mark.parametrize("robot", WALKERS)
+@pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.usefixtures("relaxed_promotion")
 def test_the_shipped_policy_walks_at_the_asked_speed(robot):
     policy = load_walking_policy(shipped_policy(robot), robot)
     (low,), (high,) = policy.contexts.low, policy.contexts.high
-    assert (low, high) == (WALKERS[robot].low, WALKERS[robot].high)
+    assert (low, high) == (ROBOTS[robot].low, ROBOTS[robot].high)
     speeds = low + jnp.array([[0.0], [0.3], [0.7], [1.0]]) * (high - low)
     thetas = jnp.stack([jnp.asarray(policy.theta(float(speed))) for (speed,) in speeds])
     physics = {"robot": robot_of(policy), "physics": c.make_control_step}
