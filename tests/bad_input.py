@@ -34,10 +34,11 @@ from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.search.archive import push
 from creps_jax.search.dual import DualSolution
 from creps_jax.search.fit import WeightedSamples, fit_within, weighted_ml
-from creps_jax.simulation import c, fit, mjx, servos, world
+from creps_jax.simulation import c, mjx, models, servos, world
 from creps_jax.simulation import state as physics_state
+from creps_jax.simulation.models import load_nao
 from creps_jax.tasks import conditions, dmp, functions, planar_arm
-from creps_jax.tasks.walking import WalkNoise, WalkReward, load_nao, record_walk
+from creps_jax.tasks.walking import WalkNoise, WalkReward, record_walk
 from creps_jax.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
 from creps_jax.walking.posture import Balance
 
@@ -629,7 +630,7 @@ ROWS = {
     ),
     "leg_fk": row(cj.leg_fk, joint_pos=array(np.zeros(6)), **WALK_POSES),
     "leg_ik": row(cj.leg_ik, T_torso_sole=array(np.eye(4)), **WALK_POSES),
-    "check_fit": made(fit.check_fit, model=record(MODEL), robot=record(NAO)),
+    "check_model": made(models.check_model, model=record(MODEL), robot=record(NAO)),
     "leg_reach": row(nao_kinematics.leg_reach, robot=record(NAO)),
     "leg_ik of a shared motor": row(
         partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))

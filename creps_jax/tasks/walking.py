@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -13,13 +12,12 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.contexts import gaussian_contexts
-from creps_jax.files import models_folder
 from creps_jax.numerics.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
 from creps_jax.policies.space import Space
 from creps_jax.robots.nao_geometry import NUM_JOINTS, NaoGeometry
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.simulation import mjx
-from creps_jax.simulation.fit import check_fit
+from creps_jax.simulation.models import check_model, load_nao
 from creps_jax.simulation.state import ControlStep, RobotState, initial_state
 from creps_jax.simulation.world import world_of
 from creps_jax.tasks.base import Task
@@ -42,8 +40,6 @@ __all__ = [
     "WalkOutcome",
     "WalkRecord",
     "WalkReward",
-    "load_nao",
-    "model_path",
     "nao_walk",
     "record_walk",
 ]
@@ -140,36 +136,6 @@ class _Progress(NamedTuple):
     set_point: Array
     measured_from: Array
     has_fallen: Array
-
-
-def load_nao(robot: Robot = NAO) -> mujoco.MjModel:
-    """Load a NAO for simulation, from the checkout or from the installed package.
-
-    What is only there to be looked at is left out. So are the joint limits' constraints, a third of all
-    constraint rows: the set-points keep within the limits, and the servos hold the joints near them.
-
-    Args:
-        robot: The simulated NAO, or `creps_jax.robots.robot.NAO_H25`, the real one.
-
-    Raises:
-        FileNotFoundError: If the model file is not there.
-    """
-    spec = mujoco.MjSpec.from_file(str(model_path(robot)))
-    spec.compiler.discardvisual = True
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
-    return spec.compile()
-
-
-def model_path(robot: Robot) -> Path:
-    """Return the file of a robot's model, in the checkout or in the installed package.
-
-    Raises:
-        FileNotFoundError: If it is not there.
-    """
-    path = models_folder() / robot.name / f"{robot.name}.xml"
-    if not path.is_file():
-        raise FileNotFoundError(f"the model of the robot {robot.name} must be in {path}, which is no file")
-    return path
 
 
 @checks.arguments
@@ -421,7 +387,7 @@ def _check_numbers(name: str, record: WalkReward | WalkNoise | Balance, *, least
 
 def _check_model(model: mujoco.MjModel, robot: Robot) -> None:
     """Refuse a model that is not the robot's, or whose time step does not divide a control step."""
-    check_fit(model, robot)
+    check_model(model, robot)
     ratio = CONTROL_PERIOD / model.opt.timestep
     if abs(ratio - round(ratio)) > 1e-6:
         raise ValueError(

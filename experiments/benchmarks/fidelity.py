@@ -19,7 +19,8 @@ import tyro  # noqa: E402
 
 from creps_jax.errors import UserError  # noqa: E402
 from creps_jax.simulation import c  # noqa: E402
-from creps_jax.tasks.walking import load_nao, nao_walk  # noqa: E402
+from creps_jax.simulation.models import load_nao  # noqa: E402
+from creps_jax.tasks.walking import nao_walk  # noqa: E402
 from creps_jax.tools import tables  # noqa: E402
 from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy  # noqa: E402
 from experiments.benchmarks.policy import speeds_of, walk_at_all_speeds  # noqa: E402

@@ -27,10 +27,11 @@ import numpy as np  # noqa: E402
 from jax.experimental import io_callback  # noqa: E402
 
 from creps_jax.simulation import c, mjx  # noqa: E402
+from creps_jax.simulation.models import load_nao  # noqa: E402
 from creps_jax.simulation.servos import read_servos  # noqa: E402
 from creps_jax.simulation.state import ControlStep, substep_shares  # noqa: E402
 from creps_jax.tasks import Task  # noqa: E402
-from creps_jax.tasks.walking import CONTROL_PERIOD, Physics, load_nao, nao_walk, record_walk  # noqa: E402
+from creps_jax.tasks.walking import CONTROL_PERIOD, Physics, nao_walk, record_walk  # noqa: E402
 from creps_jax.training import evaluate  # noqa: E402
 from experiments.walk import SETTINGS  # noqa: E402
 

@@ -7,8 +7,8 @@ import pytest
 
 from creps_jax.errors import UserError
 from creps_jax.simulation import c
+from creps_jax.simulation.models import load_nao
 from creps_jax.simulation.state import initial_state
-from creps_jax.tasks.walking import load_nao
 from experiments import walk_inside
 from experiments.probe import Measured, Probe
 

@@ -15,7 +15,7 @@ from mujoco import mjx
 from creps_jax.robots.nao_geometry import JOINT_NAMES, LEFT, NUM_JOINTS, RIGHT, leg_indices
 from creps_jax.robots.nao_kinematics import leg_fk
 from creps_jax.robots.robot import NAO, NAO_H25
-from creps_jax.simulation.fit import check_fit
+from creps_jax.simulation.models import check_model
 
 MODELS = Path(__file__).parents[2] / "models"
 SIDE_NAMES = {"left": LEFT, "right": RIGHT}
@@ -289,14 +289,14 @@ def test_file_loads_nothing_from_elsewhere(robot):
 
 
 def test_a_model_that_does_not_fit_its_robot_is_an_error():
-    check_fit(load(NAO), NAO)
-    check_fit(load(NAO_H25), NAO_H25)
+    check_model(load(NAO), NAO)
+    check_model(load(NAO_H25), NAO_H25)
     with pytest.raises(ValueError, match=r"left_shoulder_yaw must have the range of the robot nao_h25.* got"):
-        check_fit(load(NAO), NAO_H25)
+        check_model(load(NAO), NAO_H25)
     spec = mujoco.MjSpec.from_file(str(path_of(NAO)))
     spec.body("right_shank").pos[2] = -0.13
     with pytest.raises(ValueError, match=r"right_knee must be where the robot nao has it, .*-0\.235.* got"):
-        check_fit(spec.compile(), NAO)
+        check_model(spec.compile(), NAO)
 
 
 @pytest.mark.parametrize(
@@ -308,25 +308,25 @@ def test_a_model_with_other_motors_is_an_error(largest, is_limited, found):
     knee = JOINT_NAMES.index("left_knee")
     model.actuator_forcerange[knee], model.actuator_forcelimited[knee] = (-5.0, largest), is_limited
     with pytest.raises(ValueError, match=f"left_knee must .*the robot nao_h25, -5 to 5 N m, got {found}"):
-        check_fit(model, NAO_H25)
+        check_model(model, NAO_H25)
 
 
 def test_a_model_with_another_number_of_yaw_motors_is_an_error():
     model = load(NAO_H25)
     two_motors = dataclasses.replace(NAO_H25, has_one_yaw_motor=False)
     with pytest.raises(ValueError, match=r"must not hold .* of the robot nao_h25 is False, got one such"):
-        check_fit(model, two_motors)
+        check_model(model, two_motors)
     model.eq_active0[:] = 0
-    check_fit(model, two_motors)
+    check_model(model, two_motors)
     with pytest.raises(ValueError, match=r"must hold .* of the robot nao_h25 is True, got no such"):
-        check_fit(model, NAO_H25)
+        check_model(model, NAO_H25)
 
 
 def test_a_model_with_thicker_feet_is_an_error():
     model = load(NAO)
     model.geom_size[[model.geom(f"right_{corner}").id for corner in SOLE_CORNERS], 0] += 0.005
     with pytest.raises(ValueError, match=r"right sole must be .* the robot nao has it, 0\.045 m, got 0\.05"):
-        check_fit(model, NAO)
+        check_model(model, NAO)
 
 
 @pytest.mark.parametrize(

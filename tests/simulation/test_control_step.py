@@ -11,9 +11,9 @@ import pytest
 from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.rollouts import share_rows
 from creps_jax.simulation import c, mjx
+from creps_jax.simulation.models import load_nao
 from creps_jax.simulation.state import initial_state
 from creps_jax.simulation.world import World, world_of
-from creps_jax.tasks.walking import load_nao
 from tests.oracles.walk_c import servo_step
 
 PHYSICS = {"mjx": mjx.make_control_step, "c": c.make_control_step}

@@ -7,6 +7,7 @@ import pytest
 
 from creps_jax.numerics.rotations import quat_to_rpy
 from creps_jax.simulation import c
+from creps_jax.simulation.models import load_nao
 from creps_jax.simulation.world import World, changed_fields, world_of
 from creps_jax.tasks.conditions import (
     circumstances_of,
@@ -17,7 +18,7 @@ from creps_jax.tasks.conditions import (
     slope_angle,
     upward,
 )
-from creps_jax.tasks.walking import WalkNoise, load_nao, nao_walk, record_walk
+from creps_jax.tasks.walking import WalkNoise, nao_walk, record_walk
 from creps_jax.training import evaluate
 from tests.oracles.walk_c import BALANCE
 

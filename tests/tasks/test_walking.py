@@ -10,7 +10,8 @@ import pytest
 
 from creps_jax.robots.robot import NAO
 from creps_jax.simulation import c, mjx
-from creps_jax.tasks.walking import WalkNoise, WalkReward, _make_walker, load_nao, nao_walk, record_walk
+from creps_jax.simulation.models import load_nao
+from creps_jax.tasks.walking import WalkNoise, WalkReward, _make_walker, nao_walk, record_walk
 from creps_jax.training import evaluate
 from creps_jax.walking.params import params_from_theta
 from creps_jax.walking.posture import Balance
