@@ -1,24 +1,25 @@
-"""What a robot's simulation carries from one control step to the next, whoever steps it."""
+"""The state of a simulated robot and the interface of a simulator, common to MJX and C MuJoCo."""
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from creps_jax import checks
 from creps_jax.typing import Array, Float
 
-__all__ = ["ControlStep", "RobotState", "initial_state", "substep_shares"]
+__all__ = ["ControlStep", "Physics", "RobotState", "initial_state", "substep_shares"]
 
 
 class RobotState(NamedTuple):
-    """All that MuJoCo carries from one step to the next.
+    """What MuJoCo needs to continue a simulation.
 
     Attributes:
         qpos: Generalised positions (free joint first: position, wxyz quaternion), m and rad.
         qvel: Generalised velocities, m/s and rad/s.
-        qacc_warmstart: Acceleration from which the contact solver starts.
+        qacc_warmstart: Acceleration with which the contact solver starts.
     """
 
     qpos: Float[Array, " nq"]
@@ -29,23 +30,26 @@ class RobotState(NamedTuple):
 ControlStep = Callable[..., RobotState]
 """(state, set-points before, set-points after, their speeds) -> state one control step later.
 
-A fifth argument, a `physics.world.World`, takes the place of the model's own world. A state of NaN, such as
-a batch has where a robot has fallen, gives any state.
+An optional fifth argument, a `simulation.world.World`, replaces the world of the model. For a state of NaN,
+which a batch holds for a robot that has fallen, the result may be any state.
 """
+
+Physics = Callable[[mujoco.MjModel, int], ControlStep]
+"""(model, number of physics steps in a control step) -> the control step for one robot."""
 
 
 @checks.arguments
 def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:
-    """Return the state at rest in a position."""
+    """Return the state at rest in given positions."""
     zeros = jnp.zeros(num_velocities, qpos.dtype)
     return RobotState(qpos, zeros, zeros)
 
 
 @checks.arguments
 def substep_shares(num_substeps: int) -> Float[np.ndarray, " n"]:
-    """Return which share of the way from one set-point to the next each physics step of a control step has.
+    """Return the share of a control step that has passed at the end of each of its physics steps.
 
     Raises:
-        ValueError: If there is no substep.
+        ValueError: If `num_substeps` is below 1.
     """
     return np.arange(1, num_substeps + 1) / num_substeps

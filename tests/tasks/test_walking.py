@@ -11,7 +11,8 @@ import pytest
 from creps_jax.robots.robot import NAO
 from creps_jax.simulation import c, mjx
 from creps_jax.simulation.models import load_nao
-from creps_jax.tasks.walking import WalkNoise, WalkReward, _make_walker, nao_walk, record_walk
+from creps_jax.tasks.closed_loop import make_setup, plan
+from creps_jax.tasks.walking import WalkNoise, WalkReward, nao_walk, record_walk
 from creps_jax.training import evaluate
 from creps_jax.walking.params import params_from_theta
 from creps_jax.walking.posture import Balance
@@ -127,8 +128,10 @@ def test_speed_and_falls_agree_with_c_mujoco(outcome):
 
 def _start_of(theta):
     """Return the position in which a walk begins, without noise."""
-    begin, _ = _make_walker(NAO, None, 0.1, WalkNoise(0.0, 0.0, 0.0), Balance(), mjx.make_control_step)
-    return np.asarray(begin(jax.random.key(0), theta).robot.qpos, float)
+    quiet = WalkNoise(0.0, 0.0, 0.0)
+    setup = make_setup(NAO, None, 0.1, quiet, Balance(), (), mjx.make_control_step)
+    _, start = plan(setup, jax.random.key(0), theta, jnp.zeros(0))
+    return np.asarray(start.robot.qpos, float)
 
 
 def test_the_solver_is_converged_on_walking_gaits(outcome_by_c):
