@@ -48,14 +48,10 @@ def _links(robot: Robot) -> _Links:
     return _Links(hypot(forward, down), robot.geometry.shank_down, atan2(forward, down))
 
 
-@checks.arguments
 def leg_reach(robot: Robot = NAO) -> tuple[float, float]:
     """Return the least and the largest distance (m) of a robot's hip and ankle pitch axis.
 
     They are those with the knee at its lower limit, fully bent, and at its upper limit, stretched.
-
-    Raises:
-        ValueError: If `robot` is no robot.
     """
     knee = leg_indices(LEFT).start + 3
     links = _links(robot)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from creps_jax import checks
 from creps_jax.typing import Array, Float, Int
 
 __all__ = ["Servos", "read_servos"]
@@ -57,7 +56,6 @@ class Servos(NamedTuple):
         return first + shares[:, None] * way + ahead
 
 
-@checks.arguments
 def read_servos(model: mujoco.MjModel) -> Servos:
     """Read the servos out of a model.
 

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from creps_jax import checks
 from creps_jax.typing import Array, Float
 
 __all__ = ["ControlStep", "Physics", "RobotState", "initial_state", "substep_shares"]
@@ -38,18 +37,12 @@ Physics = Callable[[mujoco.MjModel, int], ControlStep]
 """(model, number of physics steps in a control step) -> the control step for one robot."""
 
 
-@checks.arguments
 def initial_state(qpos: Float[Array, " nq"], num_velocities: int) -> RobotState:
     """Return the state at rest in given positions."""
     zeros = jnp.zeros(num_velocities, qpos.dtype)
     return RobotState(qpos, zeros, zeros)
 
 
-@checks.arguments
 def substep_shares(num_substeps: int) -> Float[np.ndarray, " n"]:
-    """Return the share of a control step that has passed at the end of each of its physics steps.
-
-    Raises:
-        ValueError: If `num_substeps` is below 1.
-    """
+    """Return the share of a control step that has passed at the end of each of its physics steps."""
     return np.arange(1, num_substeps + 1) / num_substeps

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from creps_jax import checks
 from creps_jax.typing import Array, Float, ScalarLike
 
 __all__ = ["World", "changed_fields", "world_of"]
@@ -28,7 +27,6 @@ class World(NamedTuple):
     friction: ScalarLike = 1.0
 
 
-@checks.arguments
 def world_of(model: mujoco.MjModel) -> World:
     """Return the world that a model has itself."""
     return World(np.array(model.opt.gravity, np.float32))

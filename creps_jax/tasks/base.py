@@ -165,7 +165,6 @@ def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
     low, high = _checked_bounds(task, low, high)
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
-        theta = checks.array("theta", theta, (task.theta_dim,))
         return task.rollout(key, context, space.sigmoid_gate(theta, low, high))
 
     parameters = _bounded(task.parameters, low, high, "sigmoid")
@@ -196,9 +195,8 @@ def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | in
     checks.number("penalty", penalty, least=0.0)
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
-        theta = checks.array("theta", theta, (task.theta_dim,))
         violation = space.violation(theta, low, high)
-        outcome = check_outcome(task.rollout(key, context, jnp.clip(theta, low, high)))
+        outcome = check_outcome(task.rollout(key, context, jnp.clip(jnp.asarray(theta), low, high)))
         reward = outcome.reward - space.penalty(violation, penalty)  # Eq. 18
         return outcome._replace(reward=reward, violation=violation)
 

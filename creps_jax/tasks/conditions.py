@@ -15,18 +15,7 @@ from creps_jax import checks
 from creps_jax.simulation.world import World
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = [
-    "Circumstances",
-    "Condition",
-    "check_conditions",
-    "circumstances_of",
-    "friction",
-    "payload",
-    "push",
-    "slope",
-    "slope_angle",
-    "upward",
-]
+__all__ = ["Circumstances", "Condition", "friction", "payload", "push", "slope"]
 
 
 class Circumstances(NamedTuple):
@@ -143,7 +132,6 @@ def push(low: float, high: float, *, time: float = 3.0) -> Condition:
     return _checked(Condition("push", "m/s", low, high, apply, begins=time))
 
 
-@checks.arguments
 def check_conditions(conditions: Sequence[Condition], duration: float) -> None:
     """Refuse conditions that a walk of this duration, in s, cannot have.
 
@@ -165,13 +153,7 @@ def check_conditions(conditions: Sequence[Condition], duration: float) -> None:
 def circumstances_of(
     conditions: Sequence[Condition], values: Float[Array, " k"], world: World
 ) -> Circumstances | None:
-    """Put the values of all conditions into the circumstances of a walk; None without conditions.
-
-    Raises:
-        ValueError: If there is not one value for each condition.
-    """
-    checks.instance("world", world, World)
-    values = checks.array("values", values, (len(conditions),), note=", one for each of the conditions")
+    """Put the values of all conditions into the circumstances of a walk; None without conditions."""
     if not conditions:
         return None
     circumstances = Circumstances(world)
@@ -180,14 +162,12 @@ def circumstances_of(
     return circumstances
 
 
-@checks.arguments
 def upward(world: World) -> Float[Array, "3"]:
     """Return the direction against gravity, in the frame of the floor."""
     gravity = jnp.asarray(world.gravity)
     return -gravity / jnp.linalg.norm(gravity)
 
 
-@checks.arguments
 def slope_angle(world: World) -> Scalar:
     """Return by how much the floor rises ahead, rad: as far forward a trunk leans from it that is upright."""
     up = upward(world)

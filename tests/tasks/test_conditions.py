@@ -8,7 +8,7 @@ import pytest
 from creps_jax.numerics.rotations import quat_to_rpy
 from creps_jax.simulation import c
 from creps_jax.simulation.models import load_nao
-from creps_jax.simulation.world import World, changed_fields, world_of
+from creps_jax.simulation.world import changed_fields, world_of
 from creps_jax.tasks.conditions import (
     circumstances_of,
     friction,
@@ -169,7 +169,9 @@ def test_conditions_at_rest_change_no_walk_and_others_do():
         (lambda: nao_walk(conditions=(slope(0.0, 1.0), slope(0.0, 2.0))), "of its own, got slope, slope"),
         (lambda: nao_walk(duration=3.0, conditions=(push(0.0, 1.0),)), "before the end at 3.0 s, got 3.0 s"),
         (
-            lambda: circumstances_of((slope(0.0, 1.0),), jnp.zeros(2), World(jnp.zeros(3))),
+            lambda: record_walk(
+                jax.random.key(0), jnp.array(MIDDLE), conditions=(slope(0.0, 1.0),), values=jnp.zeros(2)
+            ),
             r"values must have shape \(1,\), one for each of the conditions, got \(2,\)",
         ),
     ],
