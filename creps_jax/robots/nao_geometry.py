@@ -1,10 +1,10 @@
-"""Hold the lengths, joint order and joint limits of the simulated NAO: their only home beside the model file.
+"""Lengths, joint order and joint limits of the simulated NAO; only its model file repeats them.
 
-The robot is the RoboCup 3D simulation NAO of type 0; `models/nao/SOURCE.md` names the origin of each figure.
-Lengths are in metres in the torso's frame, x forward, y left, z up, origin in the centre of the torso, at the
-zero pose: legs straight, arms stretched forward. Angles are in radians.
+The robot is the NAO of type 0 of the RoboCup 3D simulation; `models/nao/SOURCE.md` names the source of each
+value. Lengths are in metres in the torso frame at the zero pose (legs straight, arms stretched forward):
+x forward, y left, z up, origin in the centre of the torso. Angles are in radians.
 
-A side is a number, `LEFT = 1.0` or `RIGHT = -1.0`, the sign of y: mirroring multiplies by it, and functions
+A side is a number, `LEFT = 1.0` or `RIGHT = -1.0`, the sign of y: multiplication by it mirrors, and functions
 of a side can be vmapped over both legs.
 """
 
@@ -35,32 +35,32 @@ RIGHT = -1.0
 
 
 class NaoGeometry(NamedTuple):
-    """List the lengths (m), for the left side; `_y` has the other sign on the right.
+    """Lengths (m) of the left side; on the right side `_y` has the opposite sign.
 
-    The three hip axes meet in one point. The knee lies `thigh_forward` ahead of the hip, and at the zero pose
-    so does the ankle. The ankle's two axes need not meet: roll is `ankle_drop` below pitch. The defaults are
-    those of the simulated NAO.
+    The three hip axes meet in one point. At the zero pose knee and ankle are `thigh_forward` ahead of the
+    hip. The two axes of the ankle need not meet: the roll axis is `ankle_drop` below the pitch axis. The
+    defaults are the lengths of the simulated NAO.
 
     Attributes:
-        hip_x: Hip joints, from the torso's centre.
-        hip_y: The same, to the side.
-        hip_z: The same, upward.
-        thigh_forward: From hip to knee.
-        thigh_down: The same, downward.
-        shank_down: From knee to ankle pitch axis.
-        ankle_drop: From ankle pitch axis to ankle roll axis.
-        foot_down: From ankle roll axis to sole.
+        hip_x: From the centre of the torso to the hip joints, forward.
+        hip_y: From the centre of the torso to the hip joints, to the side.
+        hip_z: From the centre of the torso to the hip joints, upward.
+        thigh_forward: From hip to knee, forward.
+        thigh_down: From hip to knee, downward.
+        shank_down: From knee to ankle pitch axis, downward.
+        ankle_drop: From ankle pitch axis to ankle roll axis, downward.
+        foot_down: From ankle roll axis to sole, downward.
         foot_front: From ankle to the front edge of the sole.
-        foot_back: From ankle to its rear edge, negative.
-        foot_inner: From ankle to its edge towards the other foot.
-        foot_outer: From ankle to its other side edge.
-        shoulder_y: Shoulder joints, from the torso's centre.
-        shoulder_z: The same, upward.
-        elbow_forward: From shoulder to elbow, the arm stretched forward.
-        elbow_out: The same, to the side.
-        elbow_up: The same, upward.
-        neck_z: Neck, from the torso's centre.
-        head_pitch_z: Head pitch axis, from the torso's centre.
+        foot_back: From ankle to the rear edge of the sole, negative.
+        foot_inner: From ankle to the inner edge of the sole.
+        foot_outer: From ankle to the outer edge of the sole.
+        shoulder_y: From the centre of the torso to the shoulder joints, to the side.
+        shoulder_z: From the centre of the torso to the shoulder joints, upward.
+        elbow_forward: From shoulder to elbow, forward, with the arm stretched forward.
+        elbow_out: From shoulder to elbow, to the side.
+        elbow_up: From shoulder to elbow, upward.
+        neck_z: From the centre of the torso to the neck, upward.
+        head_pitch_z: From the centre of the torso to the head pitch axis, upward.
     """
 
     hip_x: float = -0.010
@@ -90,7 +90,7 @@ class NaoGeometry(NamedTuple):
 
     @property
     def torso_height(self) -> float:
-        """Height of the torso centre above the sole at the zero pose."""
+        """Height of the centre of the torso above the sole at the zero pose."""
         return -self.hip_z + self.thigh_down + self.shank_down + self.ankle_height
 
 
@@ -110,10 +110,10 @@ JOINT_NAMES: tuple[str, ...] = (
 NUM_JOINTS = len(JOINT_NAMES)
 """Length of every joint vector."""
 
-# Degrees, in the order above, with the simulator's signs: positive hip pitch swings the leg forward, the knee
-# bends with a negative angle, positive ankle pitch lifts the toes, positive shoulder pitch lifts the arm (at
-# -90 it hangs), positive head pitch looks up, roll and yaw are right-handed about x and z. A negative hip
-# yaw-pitch turns the toes out and swings the leg forward.
+# Degrees, in the order above, with the signs of the simulator: positive hip pitch moves the leg forward, the
+# knee bends with a negative angle, positive ankle pitch lifts the toes, positive shoulder pitch lifts the arm
+# (it hangs at -90), positive head pitch looks up, roll and yaw are right-handed about x and z. A negative hip
+# yaw-pitch turns the toes outward and moves the leg forward.
 _HEAD_RANGES = ((-120.0, 120.0), (-45.0, 45.0))
 _LEFT_ARM_RANGES = ((-120.0, 120.0), (-1.0, 95.0), (-120.0, 120.0), (-90.0, 1.0))
 _RIGHT_ARM_RANGES = ((-120.0, 120.0), (-95.0, 1.0), (-120.0, 120.0), (-1.0, 90.0))
@@ -136,17 +136,15 @@ MAX_JOINT_TORQUE = 10.0
 
 @checks.arguments
 def leg_indices(side: float | int) -> slice:
-    """Return where a leg's six joints lie in a joint vector (or in `JOINT_NAMES`), for `LEFT` or `RIGHT`.
+    """Return the indices of the six joints of a leg in a joint vector, in the order of `JOINT_NAMES`.
+
+    Args:
+        side: `LEFT` or `RIGHT`.
 
     Raises:
-        ValueError: `side` is neither `LEFT` nor `RIGHT`.
+        ValueError: If `side` is neither `LEFT` nor `RIGHT`.
     """
-    start = len(_HEAD) + 2 * len(_ARM) + _side_index(side) * len(_LEG)
-    return slice(start, start + len(_LEG))
-
-
-def _side_index(side: float | int) -> int:
-    """Return 0 for the left and 1 for the right side."""
     if side not in (LEFT, RIGHT):
         raise ValueError(f"side must be LEFT ({LEFT}) or RIGHT ({RIGHT}), got {side!r}")
-    return 0 if side == LEFT else 1
+    start = len(_HEAD) + 2 * len(_ARM) + (0 if side == LEFT else len(_LEG))
+    return slice(start, start + len(_LEG))

@@ -1,8 +1,8 @@
-"""Relate a NAO's leg joints to the pose of its sole, both ways in closed form.
+"""Forward and inverse kinematics of a NAO's leg in closed form.
 
-A sole frame lies in the lower face of the foot, straight below the ankle, x towards the toes. `joint_pos`
-(6,) is (hip yaw-pitch, hip roll, hip pitch, knee, ankle pitch, ankle roll) with the signs of `nao_geometry`.
-A side is `LEFT` or `RIGHT`, or any traced +1 / -1.
+The origin of the sole frame is in the lower face of the foot, straight below the ankle; its x axis points to
+the toes. `joint_pos` (6,) is (hip yaw-pitch, hip roll, hip pitch, knee, ankle pitch, ankle roll) with the
+signs of `nao_geometry`. A side is `LEFT` or `RIGHT`, or any traced +1 / -1.
 
 With Rx, Ry, Rz for rotations about fixed axes, s for the side and q1..q6 for the joints, the leg is::
 
@@ -31,14 +31,14 @@ _HIP_TILT = pi / 4.0
 
 
 class _Links(NamedTuple):
-    """A leg in its own plane: two straight links, and the bend between them at a knee angle of 0."""
+    """A leg in its plane: two straight links, and the angle between them at a knee angle of 0."""
 
     thigh: float
     shank: float
     bend_at_zero: float
 
     def distance(self, knee: float) -> float:
-        """Return the distance of hip and ankle pitch axis at an angle of the knee."""
+        """Return the distance between hip and ankle pitch axis at an angle of the knee."""
         bend = self.bend_at_zero - knee
         return sqrt(self.thigh**2 + self.shank**2 + 2.0 * self.thigh * self.shank * cos(bend))
 
@@ -49,9 +49,10 @@ def _links(robot: Robot) -> _Links:
 
 
 def leg_reach(robot: Robot = NAO) -> tuple[float, float]:
-    """Return the least and the largest distance (m) of a robot's hip and ankle pitch axis.
+    """Return the least and the largest distance (m) between a robot's hip and its ankle pitch axis.
 
-    They are those with the knee at its lower limit, fully bent, and at its upper limit, stretched.
+    The distance is least with the knee at its lower limit, fully bent, and largest at its upper limit,
+    stretched.
     """
     knee = leg_indices(LEFT).start + 3
     links = _links(robot)
@@ -59,11 +60,11 @@ def leg_reach(robot: Robot = NAO) -> tuple[float, float]:
 
 
 MIN_REACH, MAX_REACH = leg_reach()
-"""What `leg_reach` returns of the simulated NAO."""
+"""The least and the largest distance of `leg_reach` for the simulated NAO, m."""
 
-# Within this height (m) of the plane through the ankle roll axis and the foot's y axis, the roll angle runs
-# through 0 from one side of the plane to the other, where the exact one would jump by half a turn. Only a
-# folded leg brings the hip so near.
+# Within this height (m) of the plane through the ankle roll axis and the foot's y axis, the roll angle passes
+# continuously through 0, where the exact angle jumps by half a turn. The hip is so near to this plane only if
+# the leg is folded.
 _ROLL_FOLD = 0.003
 
 _TINY = 1e-8
@@ -76,10 +77,10 @@ def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike, *, robot: Robot = NAO
     Args:
         joint_pos: the six joint angles of the leg (rad).
         side: `LEFT` (+1) or `RIGHT` (-1).
-        robot: whose leg.
+        robot: the robot.
 
     Raises:
-        ValueError: If there are not six finite angles, or `side` is neither side.
+        ValueError: If there are not six finite angles, or `side` is neither `LEFT` nor `RIGHT`.
     """
     checks.finite("joint_pos", joint_pos)
     side = _checked_side(side, joint_pos.dtype)
@@ -114,30 +115,31 @@ def leg_ik(
     robot: Robot = NAO,
     yaw_pitch: ScalarLike | None = None,
 ) -> Float[Array, "6"]:
-    """Return the joint angles that bring the sole to a pose in the torso frame, the inverse of `leg_fk`.
+    """Return the joint angles for a pose of the sole in the torso frame, the inverse of `leg_fk`.
 
-    The solution is exact for every pose within the joint limits, except for that of a folded leg whose hip
-    comes within 3 mm of the foot's plane through the ankle roll axis (1 % of all postures within the limits).
-    There the angles differ from those of the posture, and the pose is met to 1 mm. A pose too far from the
-    hip, or too near, keeps its foot orientation, and the leg is held at its reach on the line from the ankle
-    pitch axis to the hip. The knee stays within its limits; the other angles are not clipped.
+    The solution is exact for every pose within the joint limits, except for a folded leg whose hip is within
+    3 mm of the foot's plane through the ankle roll axis (1 % of all postures within the limits). There the
+    angles differ from those of the posture, and the error of the pose is up to 1 mm. If a pose is too far
+    from the hip or too near, the foot keeps its orientation, and the leg is limited to its reach on the line
+    from the ankle pitch axis to the hip. The knee stays within its limits; the other angles are not clipped.
 
-    Angles and gradients are finite for any pose. The angles are continuous through the reach; jumps are left
-    where they are not determined, beyond the joint limits: the hip at the ankle, the hip straight below the
-    foot's ankle, and the hip yaw-pitch axis in line with the pitch axis (hip roll 45 degrees inward).
+    Angles and gradients are finite for any pose. The angles are continuous at the reach. They jump only where
+    they are not determined, beyond the joint limits: with the hip at the ankle, with the hip straight below
+    the foot's ankle, and with the hip yaw-pitch axis in line with the pitch axis (hip roll 45 degrees
+    inward).
 
-    Where the hip yaw-pitch is given, since another leg shares its motor, the place of the sole and its plane
-    are met, and its toes turn within that plane.
+    If the hip yaw-pitch is given, because both legs share its motor, position and plane of the sole are
+    exact, and the toes turn within that plane.
 
     Args:
-        T_torso_sole: wanted pose of the sole in the torso frame (m).
+        T_torso_sole: desired pose of the sole in the torso frame (m).
         side: `LEFT` (+1) or `RIGHT` (-1).
-        robot: whose leg.
+        robot: the robot.
         yaw_pitch: hip yaw-pitch (rad), for a robot whose ankle axes meet; by default that of the pose.
 
     Raises:
-        ValueError: If the pose is no finite matrix (4, 4), `side` is neither side, or `yaw_pitch` is given
-            for a robot whose ankle axes do not meet.
+        ValueError: If the pose is not a finite matrix (4, 4), `side` is neither `LEFT` nor `RIGHT`, or
+            `yaw_pitch` is given for a robot whose ankle axes do not meet.
     """
     checks.finite("T_torso_sole", T_torso_sole)
     side = _checked_side(side, T_torso_sole.dtype)
@@ -149,7 +151,7 @@ def leg_ik(
         return _solve_with_yaw_pitch(T_torso_sole, side, yaw_pitch, robot)
     R_torso_sole, position = T_torso_sole[:3, :3], T_torso_sole[:3, 3]
 
-    # The pitch joints move the hip within the xz plane of the ankle; the roll turns the hip into that plane.
+    # The pitch joints move the hip in the xz plane of the ankle; the roll turns the hip into that plane.
     hip_x, hip_y, hip_z = R_torso_sole.T @ (_hip_position(side, g) - position)
     hip_z = hip_z - g.foot_down
     height = jnp.maximum(jnp.abs(hip_z), _ROLL_FOLD)
@@ -167,7 +169,7 @@ def _solve_with_yaw_pitch(
 ) -> Float[Array, "6"]:
     """Return the joint angles for a given hip yaw-pitch, which turns the sole in its plane.
 
-    Hip roll and pitch and the knee bring the ankle to its place; its own two joints lay the sole flat.
+    Hip roll, hip pitch and knee place the ankle; the two joints of the ankle align the sole with its plane.
     """
     up, position = T_torso_sole[:3, 2], T_torso_sole[:3, 3]
     tilt = side * _HIP_TILT
@@ -175,7 +177,7 @@ def _solve_with_yaw_pitch(
     ankle = position + robot.geometry.foot_down * up - _hip_position(side, robot.geometry)
     x, y, z = R_torso_pelvis.T @ ankle
     hip_roll = safe_arctan2(y, -z)
-    # As if the sole stood square to the leg's plane: the thigh is turned from there by knee and ankle.
+    # Solved for a sole perpendicular to the leg's plane; knee and ankle turn the thigh from there.
     knee, square = _solve_plane(
         -x, jnp.sin(hip_roll) * y - jnp.cos(hip_roll) * z, _links(robot), leg_reach(robot)
     )
@@ -189,10 +191,11 @@ def _solve_with_yaw_pitch(
 def _solve_plane(
     hip_x: Scalar, hip_z: Scalar, links: _Links, reach: tuple[float, float]
 ) -> tuple[Scalar, Scalar]:
-    """Return knee and ankle pitch from the hip's place before and above the ankle pitch axis.
+    """Return knee and ankle pitch from the position of the hip ahead of and above the ankle pitch axis.
 
-    The knee bends one way only, which picks one of the two triangles. The distance is first clipped to the
-    reach; this also keeps the law of cosines away from the ends of arccos, where its gradient is infinite.
+    The knee bends in one direction only, which selects one of the two triangles. The distance is first
+    clipped to the reach; this also keeps the argument of arccos away from its ends, where the gradient is
+    infinite.
     """
     thigh, shank, bend_at_zero = links
     distance = jnp.clip(jnp.sqrt(jnp.maximum(hip_x**2 + hip_z**2, _TINY)), *reach)
@@ -205,7 +208,7 @@ def _solve_hip(R_torso_thigh: Float[Array, "3 3"], side: Scalar) -> tuple[Scalar
     """Return hip yaw-pitch, roll and pitch of a thigh orientation.
 
     ``Rx(-45 s deg) R_torso_thigh`` is ``Rz(first) Rx(second) Ry(third)``. The first angle may be
-    undetermined; the other two are read after it has been taken out, which is always well conditioned.
+    undetermined. The other two are computed after its rotation is removed, which is always well conditioned.
     """
     tilt = side * _HIP_TILT
     rotation = rotation_x(-tilt) @ R_torso_thigh

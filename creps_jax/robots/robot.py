@@ -1,6 +1,6 @@
-"""Describe the humanoids that can walk here: lengths, limits of the joints, what their motors can do.
+"""The humanoids that can walk: lengths, joint limits, and limits of the motors.
 
-All have the joints of the simulated NAO, in the order, with the signs and in the frames of `nao_geometry`.
+All have the joints of the simulated NAO, in the order and with the signs and frames of `nao_geometry`.
 """
 
 import dataclasses
@@ -22,25 +22,26 @@ __all__ = ["NAO", "NAO_H25", "Robot"]
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """What kinematics and walking engine have to know of a humanoid.
+    """The properties of a humanoid that kinematics and walking engine use.
 
-    Its three hip axes meet in one point, and its knee bends with a negative angle: see `nao_kinematics`.
+    The three hip axes must meet in one point, and the knee must bend with a negative angle, see
+    `nao_kinematics`.
 
     Attributes:
-        name: Its name, that of its folder in `models`.
-        geometry: Its lengths.
+        name: Name of the robot and of its folder in `models`.
+        geometry: Lengths.
         joint_lower: Lower limit of each joint, in the order of `nao_geometry.JOINT_NAMES`, rad.
         joint_upper: Upper limits, rad.
         max_joint_speed: Largest speed of each joint, rad/s.
         max_joint_torque: Largest torque of each joint, N m.
         com_above_hip: Height of the centre of mass above the middle of the hips, knees bent, m.
-        com_ahead_of_hip: How far it is ahead of them, m.
-        zmp_ahead_of_ankle: How far ahead of a foot's ankle the zero moment point is to be, m.
-        has_one_yaw_motor: Whether one motor turns the hip yaw-pitch of both legs, which are then equal.
+        com_ahead_of_hip: Forward distance of the centre of mass from the middle of the hips, m.
+        zmp_ahead_of_ankle: Forward distance of the planned zero moment point from the ankle of a foot, m.
+        has_one_yaw_motor: Whether one motor drives the hip yaw-pitch of both legs, which are then equal.
 
     Raises:
-        ValueError: If there is not a limit, a speed or a torque for each joint, limits are not in order, or
-            the legs share a motor and the ankle's axes do not meet, for which `leg_ik` has no solution.
+        ValueError: If there is not one limit, speed or torque for each joint, limits are not in order, or
+            the legs share a motor although the ankle axes do not meet: `leg_ik` has no solution then.
     """
 
     name: str
@@ -69,7 +70,7 @@ class Robot:
 
     @property
     def foot_spacing(self) -> float:
-        """Distance of the two feet when standing: that of the hips, m."""
+        """Distance between the feet when standing, equal to that between the hips, m."""
         return 2.0 * self.geometry.hip_y
 
 
@@ -84,15 +85,15 @@ NAO = Robot(
     com_ahead_of_hip=0.01,
     zmp_ahead_of_ankle=0.02,
 )
-"""The NAO of the RoboCup 3D simulation; `models/nao/SOURCE.md` names the origin of its figures."""
+"""The NAO of the RoboCup 3D simulation; `models/nao/SOURCE.md` names the sources of its values."""
 
 
 def _both_sides(head: tuple, left_arm: tuple, left_leg: tuple) -> tuple:
-    """Put figures that are the same on both sides in the order of the joints."""
+    """Return values that are equal on both sides, in the order of the joints."""
     return (*head, *left_arm, *left_arm, *left_leg, *left_leg)
 
 
-# Degrees; the right side mirrors the left one: rolls and yaws change their sign there.
+# Degrees. The right side mirrors the left one: rolls and yaws have the opposite sign.
 _H25_HEAD = ((-119.5, 119.5), (-29.5, 38.5))
 _H25_LEFT_ARM = ((-119.5, 119.5), (-18.0, 76.0), (-119.5, 119.5), (-88.5, -2.0))
 _H25_RIGHT_ARM = ((-119.5, 119.5), (-76.0, 18.0), (-119.5, 119.5), (2.0, 88.5))
@@ -134,7 +135,7 @@ NAO_H25 = Robot(
     zmp_ahead_of_ankle=0.02,
     has_one_yaw_motor=True,
 )
-"""The real NAO, H25; `models/nao_h25/SOURCE.md` names the origin of its figures.
+"""The real NAO, H25; `models/nao_h25/SOURCE.md` names the sources of its values.
 
-One motor turns both hips' yaw-pitch; each leg's joint has half of its torque.
+One motor drives the yaw-pitch of both hips; the joint of each leg has half of its torque.
 """

@@ -1,4 +1,4 @@
-"""The servos of a robot, read out of its MuJoCo model."""
+"""The position servos of a robot, read from its MuJoCo model."""
 
 from typing import NamedTuple
 
@@ -14,8 +14,8 @@ class Servos(NamedTuple):
     """The position servos of a robot, each on a joint with one degree of freedom.
 
     Attributes:
-        stiffness: Torque for an error of the position, N m/rad.
-        damping: Torque for an error of the speed, N m s/rad.
+        stiffness: Torque per position error, N m/rad.
+        damping: Torque per speed error, N m s/rad.
         control_range: Lowest and highest set-points, rad.
         torque_range: Lowest and highest torques, N m.
         qpos_index: Index of each joint's position in qpos.
@@ -31,7 +31,7 @@ class Servos(NamedTuple):
 
     @property
     def lead(self) -> Float[np.ndarray, " nu"]:
-        """How far ahead of a moving set-point its damping costs a servo nothing, s."""
+        """Time by which a set-point must lead, so that the damping does not hold back the motion, s."""
         return self.damping / self.stiffness
 
     def controls(
@@ -41,12 +41,12 @@ class Servos(NamedTuple):
         after: Float[Array | np.ndarray, "*b nu"],
         speed: Float[Array | np.ndarray, "*b nu"],
     ) -> Float[Array | np.ndarray, "*b n nu"]:
-        """Return what the servos are told in each physics step of a control step, rad.
+        """Return the controls of the servos in each physics step of a control step, rad.
 
-        The set-points, ahead by `lead`, so that the servos' damping does not hold the motion back.
+        They are the set-points, interpolated between both ends of the control step, ahead by `lead`.
 
         Args:
-            shares: What `physics.state.substep_shares` gives for the number of steps.
+            shares: Share of the control step after each physics step, see `simulation.state.substep_shares`.
             before: Set-points at the start of the control step, rad.
             after: Set-points at its end, rad.
             speed: The set-points' speed, rad/s.
@@ -57,10 +57,10 @@ class Servos(NamedTuple):
 
 
 def read_servos(model: mujoco.MjModel) -> Servos:
-    """Read the servos out of a model.
+    """Read the servos of a model.
 
     Raises:
-        ValueError: If an actuator is no plain position servo on a joint; it names them.
+        ValueError: If an actuator is not a plain position servo on a joint; the message names them.
     """
     stiffness, damping = model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 2]
     is_servo = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
@@ -87,5 +87,5 @@ def read_servos(model: mujoco.MjModel) -> Servos:
 
 
 def _range(is_limited: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """Return the lowest and the highest value of each actuator (2, nu), infinite where it has no limits."""
+    """Return the lowest and the highest value of each actuator (2, nu), infinite without limits."""
     return np.where(is_limited.astype(bool), limits.T, [[-np.inf], [np.inf]])

@@ -1,4 +1,4 @@
-"""What acts on a robot that its model does not settle: gravity, a payload, the friction of the floor."""
+"""The world of a robot, which can differ between the robots of a batch: gravity, payload and friction."""
 
 from typing import NamedTuple
 
@@ -10,16 +10,16 @@ from creps_jax.typing import Array, Float, ScalarLike
 __all__ = ["World", "changed_fields", "world_of"]
 
 _LOADED_BODY = 1
-"""MuJoCo's number of the first body of a robot, its torso; 0 is the world."""
+"""MuJoCo's index of the first body of a robot, the torso; 0 is the world."""
 
 
 class World(NamedTuple):
-    """The world of one robot, for the length of a control step.
+    """The world of one robot during a control step.
 
     Attributes:
         gravity: Acceleration of gravity in the frame of the floor, m/s^2.
-        payload: Mass that is added at the centre of mass of the first body, kg; it has no extent.
-        friction: How many times the model's coefficients sliding friction has.
+        payload: Point mass that is added at the centre of mass of the first body, kg.
+        friction: Factor of the model's coefficients of sliding friction.
     """
 
     gravity: Float[Array, "3"] | Float[np.ndarray, "3"]
@@ -28,16 +28,16 @@ class World(NamedTuple):
 
 
 def world_of(model: mujoco.MjModel) -> World:
-    """Return the world that a model has itself."""
+    """Return the world of a model itself: its gravity, no payload, its friction."""
     return World(np.array(model.opt.gravity, np.float32))
 
 
 def changed_fields(
     model: mujoco.MjModel, world: World
 ) -> dict[str, Float[Array, "..."] | Float[np.ndarray, "..."]]:
-    """Return the fields of MuJoCo's model, by name, in which a world differs from it.
+    """Return the fields of MuJoCo's model that depend on the world, by name.
 
-    The softness of contacts, which MuJoCo works out from the masses when it compiles a model, stays.
+    The softness of contacts, which MuJoCo computes from the masses when it compiles a model, is not changed.
     """
     is_loaded = (np.arange(model.nbody) == _LOADED_BODY).astype(np.float32)
     is_sliding = np.array([[1.0, 0.0, 0.0]], np.float32)

@@ -1,6 +1,6 @@
 """Tasks to learn, and wrappers from task to task.
 
-`nao_walk` needs MuJoCo, which is imported when the walking task is first asked for, not before.
+`nao_walk` needs MuJoCo, which is imported when `nao_walk` is first accessed.
 """
 
 import importlib

@@ -1,7 +1,7 @@
-"""What a task is, and wrappers from task to task.
+"""Tasks, their outcomes, and wrappers from task to task.
 
-A task knows nothing of learning: it draws contexts and turns (key, context, theta) into an
-outcome. Everything is written for one rollout; the caller vmaps.
+A task is independent of the search: it samples contexts and maps (key, context, theta) to an outcome. All
+functions are for one rollout; the caller vmaps them.
 """
 
 import dataclasses
@@ -32,10 +32,10 @@ __all__ = [
 
 @runtime_checkable
 class Outcome(Protocol):
-    """What a rollout brings back: a NamedTuple of arrays with at least these two fields.
+    """The result of a rollout: a NamedTuple of arrays with at least these two fields.
 
-    A task returns a NamedTuple of its own and may add fields (speed, whether the robot fell);
-    wrappers and the training loop carry them along.
+    The NamedTuple of a task may have more fields, such as a speed or whether the robot fell. Wrappers and the
+    training loop keep them.
     """
 
     @property
@@ -45,14 +45,14 @@ class Outcome(Protocol):
 
     @property
     def violation(self) -> Float[Array, "*b c"]:
-        """How far each constraint on theta is violated, zero where it holds; c is 0 without any."""
+        """Violation of each of c constraints on theta: 0 if it holds, else positive; c may be 0."""
         ...
 
     def _replace(self, **fields: Any) -> Any: ...
 
 
 class PlainOutcome(NamedTuple):
-    """The outcome of a task that has nothing to add."""
+    """The outcome of a task without further fields."""
 
     reward: Float[Array, ""]
     violation: Float[Array, " c"]
@@ -60,16 +60,19 @@ class PlainOutcome(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Task(KeepsPrograms):
-    """A contextual task: a record of pure functions, closed over and never traced.
+    """A contextual task: a record of pure functions. It is hashable, and never traced.
 
     Attributes:
         sample_context: (key) -> context (s,).
-        rollout: (key, context (s,), theta (d,)) -> outcome of one rollout, or its reward alone.
+        rollout: (key, context (s,), theta (d,)) -> outcome of one rollout, or only its reward.
         context_dim: Number s of context variables.
         theta_dim: Number d of parameters.
-        worst_reward: The finite reward put in place of one that is not finite.
+        worst_reward: The finite reward that replaces one that is not finite.
         contexts: Names, units and ranges of the context variables, for `learned`; None if not stated.
         parameters: Names, units and bounds of the parameters, for `learned`; None if not stated.
+
+    Raises:
+        ValueError: If a field is not of its kind.
     """
 
     sample_context: Callable[[PRNGKey], Array]
@@ -86,7 +89,7 @@ class Task(KeepsPrograms):
         checks.function("rollout", self.rollout, "(key, context, theta) -> outcome")
         checks.count("context_dim", self.context_dim)
         checks.count("theta_dim", self.theta_dim)
-        # An array could not be compiled for.
+        # A plain number: programs are compiled for a hashable task.
         object.__setattr__(self, "worst_reward", checks.number("worst_reward", self.worst_reward))
         for name, size in (("contexts", self.context_dim), ("parameters", self.theta_dim)):
             stated = getattr(self, name)
@@ -100,12 +103,12 @@ class Task(KeepsPrograms):
 
 
 def check_outcome(outcome: Any) -> Any:
-    """Return what a rollout gave, after checking that it is an outcome of arrays with one reward.
+    """Return the result of a rollout after checking that it is an outcome of arrays with one reward.
 
     A bare reward becomes a `PlainOutcome`.
 
     Raises:
-        ValueError: If it is neither.
+        ValueError: If the result is neither an outcome nor a reward.
     """
     if not isinstance(outcome, Outcome):
         is_number = isinstance(outcome, jax.Array | np.ndarray | np.number | float | int)
@@ -124,18 +127,18 @@ def check_outcome(outcome: Any) -> Any:
 
 @checks.arguments
 def average_repeats(task: Task, repeats: int) -> Task:
-    """Average every rollout over repeats with keys of their own (Abdolmaleki et al. 2016, 4.3.1).
+    """Average every rollout over repeats with different keys (Abdolmaleki et al. 2016, 4.3.1).
 
     Args:
         task: The task to repeat.
-        repeats: How often a rollout is repeated, at least 1.
+        repeats: Number of repeats of a rollout, at least 1.
 
     Returns:
-        A task whose outcome is the mean of each field over the repeats; booleans and integers
-        become the float fraction or mean. One repeat that is not finite makes the mean so.
+        A task whose outcome is the mean of each field over the repeats. Booleans become a fraction, and
+        integers a mean, both floats. If one repeat is not finite, neither is the mean.
 
     Raises:
-        ValueError: If repeats < 1.
+        ValueError: If `repeats` is below 1.
     """
 
     def rollout(key: PRNGKey, context: Array, theta: Array) -> Any:
@@ -149,7 +152,7 @@ def average_repeats(task: Task, repeats: int) -> Task:
 
 @checks.arguments
 def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
-    """Let theta be free and squash it into [low, high] (Abdolmaleki et al. 2016, Eq. 17).
+    """Map a free theta into [low, high] by a sigmoid (Abdolmaleki et al. 2016, Eq. 17).
 
     Args:
         task: A task whose theta has bounds.
@@ -157,7 +160,7 @@ def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
         high: Upper bounds (d,).
 
     Returns:
-        A task of the same size whose theta is any vector of real numbers.
+        A task of the same size whose theta may be any vector of real numbers.
 
     Raises:
         ValueError: If the bounds do not fit the task or each other.
@@ -173,20 +176,20 @@ def sigmoid_constrained(task: Task, low: VectorLike, high: VectorLike) -> Task:
 
 @checks.arguments
 def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | int) -> Task:
-    """Charge a penalty where theta leaves [low, high] (the 1_p of Abdolmaleki et al. 2016, Eq. 18).
+    """Subtract a penalty if theta is outside [low, high] (the 1_p of Abdolmaleki et al. 2016, Eq. 18).
 
-    The rollout itself is run at theta clipped to the box, so that a parameter without a
-    meaning (a negative duration) never reaches the task.
+    The rollout gets theta clipped to the bounds, so that a meaningless parameter, such as a negative
+    duration, never reaches the task.
 
     Args:
         task: A task whose theta has bounds.
         low: Lower bounds (d,), in the units of the task's theta.
         high: Upper bounds (d,).
-        penalty: Taken from the reward if any bound is violated, by however little.
+        penalty: Subtracted from the reward if any bound is violated, regardless of the amount.
 
     Returns:
-        A task of the same size whose outcome carries the violation of each bound, and whose
-        worst reward includes the penalty.
+        A task of the same size whose outcome holds the violation of each bound, and whose worst reward
+        includes the penalty.
 
     Raises:
         ValueError: If the bounds do not fit the task or each other, or the penalty is negative.

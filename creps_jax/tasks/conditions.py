@@ -1,7 +1,7 @@
-"""What a walk may meet besides the speed it is asked for, each a variable of the context.
+"""Conditions of a walk besides the commanded speed, each a variable of the context.
 
-A condition is a value: a name, a range, and a function that puts a number into the circumstances of a walk.
-`nao_walk(conditions=(slope(-5.0, 5.0), payload(0.0, 1.0)))` has the context (speed, slope, payload).
+A condition is a record: a name, a range, and a function that writes its value into the circumstances of a
+walk. `nao_walk(conditions=(slope(-5.0, 5.0), payload(0.0, 1.0)))` has the context (speed, slope, payload).
 """
 
 import math
@@ -19,12 +19,12 @@ __all__ = ["Circumstances", "Condition", "friction", "payload", "push", "slope"]
 
 
 class Circumstances(NamedTuple):
-    """What a walk meets.
+    """The values of all conditions of one walk.
 
     Attributes:
-        world: The world it goes through, in the frame of the floor.
-        push: What is added to the robot's velocity to the left, m/s.
-        push_time: When that is, s; None where there is no push.
+        world: The world of the robot, in the frame of the floor.
+        push: Velocity to the left that a push adds to that of the robot, m/s.
+        push_time: Time of the push, s; None without a push.
     """
 
     world: World
@@ -36,12 +36,12 @@ class Condition(NamedTuple):
     """One variable of the context.
 
     Attributes:
-        name: What it is.
-        unit: Its unit.
-        low: Its lowest value.
-        high: Its highest value.
-        apply: (circumstances, value) -> the circumstances with it.
-        begins: From when on it is felt, s.
+        name: Name of the condition.
+        unit: Unit of its value.
+        low: Lowest value.
+        high: Highest value.
+        apply: (circumstances, value) -> the circumstances with this value.
+        begins: Time from which the condition acts, s.
     """
 
     name: str
@@ -54,10 +54,10 @@ class Condition(NamedTuple):
 
 @checks.arguments
 def slope(low: float, high: float) -> Condition:
-    """Let the floor rise ahead of the robot, by an angle in degrees; below zero it falls.
+    """Let the floor rise ahead of the robot by an angle in degrees; with a negative angle it descends.
 
-    All positions, and so the speed, stay in the frame of the floor: gravity turns about y instead. The robot
-    is told the slope. Its steps follow the floor, and its lean counts from the vertical.
+    All positions, and so the speed, are in the frame of the floor; gravity is rotated about y instead. The
+    robot knows the slope: its steps follow the floor, and its lean is measured from the vertical.
 
     Args:
         low: Lowest slope, deg; above -90.
@@ -67,7 +67,7 @@ def slope(low: float, high: float) -> Condition:
         The condition.
 
     Raises:
-        ValueError: If the range is not in order, or not within 90 degrees.
+        ValueError: If the range is not in order, or not within -90 to 90 degrees.
     """
 
     def apply(circumstances: Circumstances, value: Scalar) -> Circumstances:
@@ -81,10 +81,17 @@ def slope(low: float, high: float) -> Condition:
 
 @checks.arguments
 def payload(low: float, high: float) -> Condition:
-    """Load the torso with a mass at its centre, in kg.
+    """Add a mass to the torso at its centre of mass, in kg.
+
+    Args:
+        low: Lowest mass, kg; at least 0.
+        high: Highest mass, kg.
+
+    Returns:
+        The condition.
 
     Raises:
-        ValueError: If the range is not in order, or begins below zero.
+        ValueError: If the range is not in order, or its lower end is below 0.
     """
 
     def apply(circumstances: Circumstances, value: Scalar) -> Circumstances:
@@ -95,10 +102,17 @@ def payload(low: float, high: float) -> Condition:
 
 @checks.arguments
 def friction(low: float, high: float) -> Condition:
-    """Multiply the friction of the robot's model, whose coefficient is 1 for the NAO.
+    """Multiply the sliding friction of the robot's model, whose coefficient is 1 for the NAO.
+
+    Args:
+        low: Lowest factor; above 0.
+        high: Highest factor.
+
+    Returns:
+        The condition.
 
     Raises:
-        ValueError: If the range is not in order, or does not stay above zero.
+        ValueError: If the range is not in order, or its lower end is not above 0.
     """
 
     def apply(circumstances: Circumstances, value: Scalar) -> Circumstances:
@@ -109,14 +123,15 @@ def friction(low: float, high: float) -> Condition:
 
 @checks.arguments
 def push(low: float, high: float, *, time: float = 3.0) -> Condition:
-    """Push the robot once: all of it moves faster to the left at once, by a velocity in m/s.
+    """Push the robot once: add a velocity in m/s to the left to the whole robot at one time.
 
-    That is the impulse which would do so in the air. On the ground the floor holds the standing foot.
+    The push is the impulse that causes this velocity in the air. On the ground the floor holds the standing
+    foot.
 
     Args:
-        low: Lowest velocity, m/s; below zero it is to the right.
+        low: Lowest velocity, m/s; a negative velocity is to the right.
         high: Highest velocity, m/s.
-        time: When it is pushed, s.
+        time: Time of the push, s.
 
     Returns:
         The condition.
@@ -133,10 +148,11 @@ def push(low: float, high: float, *, time: float = 3.0) -> Condition:
 
 
 def check_conditions(conditions: Sequence[Condition], duration: float) -> None:
-    """Refuse conditions that a walk of this duration, in s, cannot have.
+    """Check that a walk of this duration, in s, can have these conditions.
 
     Raises:
-        ValueError: If two have one name, of which the last would count, or one begins after the end.
+        ValueError: If two have the same name (the second would replace the first), or one begins after the
+            end.
     """
     if not isinstance(conditions, Sequence) or not all(isinstance(each, Condition) for each in conditions):
         raise ValueError(f"conditions must be a list of Condition, got {checks.shown(conditions)}")
@@ -153,7 +169,7 @@ def check_conditions(conditions: Sequence[Condition], duration: float) -> None:
 def circumstances_of(
     conditions: Sequence[Condition], values: Float[Array, " k"], world: World
 ) -> Circumstances | None:
-    """Put the values of all conditions into the circumstances of a walk; None without conditions."""
+    """Return the circumstances of a walk with the value of each condition; None without conditions."""
     if not conditions:
         return None
     circumstances = Circumstances(world)
@@ -169,7 +185,7 @@ def upward(world: World) -> Float[Array, "3"]:
 
 
 def slope_angle(world: World) -> Scalar:
-    """Return by how much the floor rises ahead, rad: as far forward a trunk leans from it that is upright."""
+    """Return the slope of the floor ahead, rad: also the lean of a vertical trunk from the floor's normal."""
     up = upward(world)
     return jnp.arctan2(up[0], up[2])
 
@@ -177,10 +193,10 @@ def slope_angle(world: World) -> Scalar:
 def _checked(
     condition: Condition, *, above: float = -np.inf, below: float = np.inf, least: float = -np.inf
 ) -> Condition:
-    """Return a condition whose range is in order and within these limits.
+    """Return a condition after checking that its range is in order and within these limits.
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If the range is not.
     """
     name, _, low, high, *_ = condition
     checks.ends(low, high)

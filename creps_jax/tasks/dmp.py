@@ -1,4 +1,4 @@
-"""Move joints by discrete dynamic movement primitives."""
+"""Discrete dynamic movement primitives (DMPs) for movements of joints."""
 
 import math
 from typing import NamedTuple
@@ -12,8 +12,8 @@ from creps_jax.typing import Array, Float
 
 __all__ = ["DmpTrajectory", "dmp_trajectory", "fit_dmp"]
 
-# The attractor is critically damped. Time constants of it that go by in one duration: a distance between
-# start and goal shrinks to 5e-5 of it.
+# Number of time constants of the critically damped attractor in one duration: the distance to the goal
+# shrinks to 5e-5 of its first value.
 _RATE = 12.5
 # The phase falls from 1 to 0.01 over the duration, and the forcing with it.
 _PHASE_DECAY = math.log(100.0)
@@ -42,22 +42,23 @@ def dmp_trajectory(
     duration: float,
     num_steps: int,
 ) -> DmpTrajectory:
-    """Move from rest at the start towards the goal, each coordinate by a primitive of its own.
+    """Move from rest at the start towards the goal, with one primitive for each coordinate.
 
-    A primitive is a critically damped spring towards the goal, `T^2 y'' = a (a/4 (g + f(x) - y) - T y')`,
-    whose rest position a forcing term f moves about: normalised Gaussian bases of the phase x, weighted,
-    times x. The weights are thus in the units of the goal. The phase, one for all, falls from 1 to 0.01 in
-    a duration: there the movement is within some 0.025 of the last weights of its goal, and nearly at rest.
-    Times scale with the duration, and nothing else does.
+    A primitive is a critically damped spring towards the goal, `T^2 y'' = a (a/4 (g + f(x) - y) - T y')`. The
+    forcing term f displaces its rest position: the weighted sum of normalised Gaussian bases of the phase x,
+    times x. The weights thus have the units of the goal. All primitives share the phase, which falls from 1
+    to 0.01 in a duration. At its end the movement is nearly at rest, and its distance from the goal is at
+    most about 0.025 times the last weights. Only times scale with the duration.
 
-    Each step is the spring's exact motion under the forcing in its middle: no step is too long.
+    Each step is the exact motion of the spring under the forcing at the middle of the step, so that steps may
+    have any length.
 
     Args:
         weights: Weights of the bases, a column for each coordinate.
         start: Position at the start.
         goal: Position to rest at.
         duration: T, s.
-        num_steps: Steps in a duration.
+        num_steps: Number of steps in a duration.
 
     Returns:
         The movement.
@@ -65,8 +66,8 @@ def dmp_trajectory(
     Raises:
         ValueError: If there is no step or no basis, the duration is not positive, or shapes do not fit.
 
-    Source: Ijspeert et al. 2013, Eq. 2.1 to 2.5, without scaling by the amplitude, which fails where start
-    and goal are equal; the forcing is divided by the spring's stiffness.
+    Source: Ijspeert et al. 2013, Eq. 2.1 to 2.5, without scaling by the amplitude, which fails if start and
+    goal are equal; the forcing is divided by the spring's stiffness.
     """
     checks.number("duration", duration, above=0.0)
     dtype = weights.dtype
@@ -75,7 +76,7 @@ def dmp_trajectory(
     step_length = 1.0 / num_steps
     decay = math.exp(-_RATE * step_length)
 
-    # In here time is counted in durations.
+    # The unit of time is the duration.
     def step(carry, rest):
         pos, vel = carry
         offset = pos - rest
@@ -94,7 +95,7 @@ def dmp_trajectory(
 def fit_dmp(pos: Float[Array, "n d"], num_basis: int) -> Float[Array, "b d"]:
     """Fit weights to a demonstration that starts at rest, by least squares of the positions.
 
-    A movement is linear in its weights, so this is one linear system; no derivatives are taken of the
+    A movement is linear in its weights, so the fit is one linear system, and needs no derivatives of the
     demonstration.
 
     Args:
@@ -102,10 +103,10 @@ def fit_dmp(pos: Float[Array, "n d"], num_basis: int) -> Float[Array, "b d"]:
         num_basis: Number of bases.
 
     Returns:
-        Weights for `dmp_trajectory` with the demonstration's first and last position.
+        Weights for `dmp_trajectory` from the first to the last position of the demonstration.
 
     Raises:
-        ValueError: If the demonstration has fewer steps than there are bases, or there is no basis.
+        ValueError: If the demonstration has fewer steps than bases, or there is no basis.
     """
     if pos.shape[0] <= num_basis:
         raise ValueError(f"num_basis must be less than the {pos.shape[0]} positions of pos, got {num_basis}")

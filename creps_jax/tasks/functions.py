@@ -1,4 +1,4 @@
-"""Test functions of optimisation, to be minimised, and the task of following one that the context moves."""
+"""Test functions of optimisation, to be minimised, and a task in which the context moves the minimum."""
 
 import math
 from collections.abc import Callable
@@ -21,24 +21,23 @@ def contextual_function(
     low: float = 1.0,
     high: float = 2.0,
 ) -> Task:
-    """Ask for the parameters at which a function, moved by an affine function of the context, is least.
+    """Make the task of minimising a function whose minimum is moved by a linear function of the context.
 
-    The reward is `-function(theta + transform @ context)`, so that the best policy is affine in the
-    context whatever the function. With entries of `transform` and of the first mean drawn from N(0, 1), a
-    first covariance of I, 20 parameters, two contexts and 50 samples an iteration this is the field's
-    benchmark.
+    The reward is `-function(theta + transform @ context)`: the optimal policy is affine in the context for
+    any function. The usual benchmark has 20 parameters, two contexts and 50 samples an iteration, draws the
+    entries of `transform` and of the first mean from N(0, 1), and starts with the covariance I.
 
     Args:
-        function: What to minimise, of d parameters.
-        transform: How far each context variable moves each parameter.
-        low: Lower end of each context variable.
-        high: Upper end of it.
+        function: The function of d parameters to minimise.
+        transform: Displacement of each parameter per unit of each context variable.
+        low: Lower end of the range of each context variable.
+        high: Upper end of that range.
 
     Returns:
-        The task, with uniform contexts; it has no noise.
+        The task, with uniform contexts and without noise.
 
     Raises:
-        ValueError: If `transform` is no finite matrix, or the range is not in order.
+        ValueError: If `transform` is not a finite matrix, or the range is not in order.
 
     Source: Abdolmaleki et al. 2017, Contextual covariance matrix adaptation evolutionary strategies,
     Section 4.1.
@@ -60,31 +59,31 @@ def contextual_function(
 
 @checks.arguments
 def sphere(x: Float[Array, " d"]) -> Scalar:
-    """Return the sum of squares: round, with the minimum 0 at 0."""
+    """Return the sum of squares; the minimum is 0 at x = 0."""
     return jnp.sum(x**2)
 
 
 @checks.arguments
 def ellipsoid(x: Float[Array, " d"]) -> Scalar:
-    """Return a sum of squares whose weights rise from 1 to 1e6: long and narrow, with the minimum 0 at 0."""
+    """Return a sum of squares with weights from 1 to 1e6, ill-conditioned; the minimum is 0 at x = 0."""
     return jnp.sum(10.0 ** jnp.linspace(0.0, 6.0, x.size, dtype=x.dtype) * x**2)
 
 
 @checks.arguments
 def rosenbrock(x: Float[Array, " d"]) -> Scalar:
-    """Return Rosenbrock's function of two variables or more: a bent valley, with the minimum 0 at 1."""
+    """Return Rosenbrock's function of two or more variables, a curved valley; the minimum is 0 at x = 1."""
     return jnp.sum(100.0 * (x[1:] - x[:-1] ** 2) ** 2 + (1.0 - x[:-1]) ** 2)
 
 
 @checks.arguments
 def rastrigin(x: Float[Array, " d"]) -> Scalar:
-    """Return Rastrigin's function: a sphere under an egg box, with the least of its minima, 0, at 0."""
+    """Return Rastrigin's function, a sphere with many local minima; the global minimum is 0 at x = 0."""
     return jnp.sum(x**2 + 10.0 * (1.0 - jnp.cos(2.0 * math.pi * x)))
 
 
 @checks.arguments
 def ackley(x: Float[Array, " d"]) -> Scalar:
-    """Return Ackley's function: a funnel in a nearly flat egg box, with the least of its minima, 0, at 0."""
+    """Return Ackley's function, nearly flat with many local minima; the global minimum is 0 at x = 0."""
     root_mean_square = jnp.sqrt(jnp.mean(x**2))
     mean_cosine = jnp.mean(jnp.cos(2.0 * math.pi * x))
     return 20.0 * (1.0 - jnp.exp(-0.2 * root_mean_square)) + math.e - jnp.exp(mean_cosine)

@@ -30,20 +30,20 @@ NUM_BASIS = 5
 NUM_STEPS = 100
 DURATION = 3.0
 _VIA_STEP = 50
-# The arm starts pointing straight up, and ends the via-point task stretched out along the ground.
+# The arm starts straight up. In the via-point task it ends stretched out along the ground.
 _START = (0.0, 0.0, 0.0)
 _STRETCHED = (0.5 * math.pi, 0.0, 0.0)
 _STRETCHED_POINT = (3.0, 0.0)
 
 
 class HoleOutcome(NamedTuple):
-    """What reaching into the hole brings.
+    """The outcome of reaching into the hole.
 
     Attributes:
         reward: See `hole_reaching`.
         violation: Empty.
-        num_collisions: Time steps at which a link is in the ground.
-        distance: Last distance of the end effector from the middle of the hole's floor, m.
+        num_collisions: Number of time steps at which a link is in the ground.
+        distance: Final distance of the end effector from the middle of the hole's floor, m.
     """
 
     reward: Float[Array, ""]
@@ -59,24 +59,24 @@ def via_point_reaching(
     *,
     sample_context: Callable[[PRNGKey], Array] | None = None,
 ) -> Task:
-    """Ask an arm to pass a point half-way, and to end stretched out to the right.
+    """Make the task in which an arm passes a via-point half-way and ends stretched out to the right.
 
-    The context is the via-point (x, y), m; theta holds the weights of the DMPs, a row of
-    three joints for each of five bases, rad. The goal of the DMPs is the stretched posture. The reward is
+    The context is the via-point (x, y), m. Theta holds the weights of the DMPs, a row of three joints for
+    each of five bases, rad. The goal of the DMPs is the stretched posture. The reward is
     `-1e4 (|p_50 - v|^2 + |p_100 - (3, 0)|^2) - 0.5 sum |acceleration|^2`, over 100 steps of 0.03 s.
 
     Args:
-        low: Lower ends of the via-point's range, m.
-        high: Upper ends of it, m.
+        low: Lower ends of the range of the via-point, m.
+        high: Upper ends of that range, m.
         sample_context: (key) -> via-point (2,); by default Gaussian about the middle, clipped to the range.
 
     Returns:
-        The task; it has no noise.
+        The task, without noise.
 
     Raises:
-        ValueError: If the range is not in order, or not of two variables.
+        ValueError: If the range is not in order, or does not have two variables.
 
-    Source: Abdolmaleki et al. 2016, Section 4.2; the end point (5, 0) in print is out of reach.
+    Source: Abdolmaleki et al. 2016, Section 4.2; the printed end point (5, 0) is out of reach.
     """
     if checks.vector("low", low).shape != (2,):
         raise ValueError(f"low must have two entries, of x and y, got {checks.shown(low)}")
@@ -93,7 +93,7 @@ def via_point_reaching(
         reward = -1e4 * miss - 0.5 * jnp.sum(jnp.square(movement.acc))
         return PlainOutcome(reward, jnp.zeros(0, theta.dtype))
 
-    contexts = Space(("via_x", "via_y"), *_tuples(low, high), ("m", "m"))
+    contexts = Space(("via_x", "via_y"), _tuple(low), _tuple(high), ("m", "m"))
     parameters = _dmp_parameters(num_goals=0)
     return Task(sample_context, rollout, 2, parameters.size, -1e7, contexts, parameters)
 
@@ -107,29 +107,29 @@ def hole_reaching(
     depth: float = 1.0,
     sample_context: Callable[[PRNGKey], Array] | None = None,
 ) -> Task:
-    """Ask an arm to end at the bottom of a hole in the ground, without touching ground or walls.
+    """Make the task in which an arm ends at the bottom of a hole in the ground without any collision.
 
-    The context is the x of the hole's middle, m; theta holds the weights of the DMPs, a row of three joints
+    The context is the x of the hole's middle, m. Theta holds the weights of the DMPs, a row of three joints
     for each of five bases, and then their goals, rad. The reward is
     `-1e5 (d^2 + number of steps in collision) - 10 sum |acceleration|^2`, over 100 steps of 0.03 s. Here d is
-    the last distance from the middle of the hole's floor, but after a collision no less than the first one:
-    a movement through the ground has reached nothing. So colliding never beats standing still.
+    the final distance from the middle of the hole's floor; after a collision it is at least the initial
+    distance, so that a movement through the ground is never better than standing still.
 
     Args:
-        low: Lowest middle of the hole, m.
-        high: Highest one, m.
+        low: Lowest x of the hole's middle, m.
+        high: Highest x of the hole's middle, m.
         width: Width of the hole, m.
         depth: Depth of the hole, m.
-        sample_context: (key) -> middle (1,); by default Gaussian about the range's middle, clipped to it.
+        sample_context: (key) -> x (1,); by default Gaussian about the middle of the range, clipped to it.
 
     Returns:
-        The task; it has no noise.
+        The task, without noise.
 
     Raises:
-        ValueError: If the range is not in order, or the hole is not one.
+        ValueError: If the range is not in order, or width or depth are not positive.
 
-    Source: Abdolmaleki et al. 2016, Section 4.2; the weights 1e5 and 10, and the length of a step, are those
-    of its author's published settings.
+    Source: Abdolmaleki et al. 2016, Section 4.2; the weights 1e5 and 10, and the duration of a step, are from
+    its author's published settings.
     """
     checks.number("width", width, above=0.0)
     checks.number("depth", depth, above=0.0)
@@ -156,13 +156,13 @@ def hole_reaching(
 
 @checks.arguments
 def via_point_movement(theta: Float[Array, "15"]) -> DmpTrajectory:
-    """Return the joints' movement in `via_point_reaching`, rad and s."""
+    """Return the movement of the joints in `via_point_reaching`, rad and s."""
     return _movement(theta, jnp.array(_STRETCHED, theta.dtype))
 
 
 @checks.arguments
 def hole_movement(theta: Float[Array, "18"]) -> DmpTrajectory:
-    """Return the joints' movement in `hole_reaching`, rad and s."""
+    """Return the movement of the joints in `hole_reaching`, rad and s."""
     return _movement(theta[:-NUM_LINKS], theta[-NUM_LINKS:])
 
 
@@ -171,7 +171,8 @@ def arm_points(joint_pos: Float[Array, " k"]) -> Float[Array, "k+1 2"]:
     """Return the ends of the links of 1 m, from the base at the origin to the end effector.
 
     Args:
-        joint_pos: Angle of each link from the one before it, the first from the vertical, clockwise, rad.
+        joint_pos: Angle of each link relative to the previous one, of the first to the vertical, clockwise,
+            rad.
 
     Returns:
         Points (x, y), m.
@@ -185,13 +186,13 @@ def arm_points(joint_pos: Float[Array, " k"]) -> Float[Array, "k+1 2"]:
 def hits_ground(
     points: Float[Array, "n 2"], center: Scalar, width: ScalarLike, depth: ScalarLike
 ) -> Bool[Array, ""]:
-    """Say whether any part of a chain of links is in the ground, which has one hole.
+    """Return whether any part of a chain of links is in the ground, which has one hole.
 
-    It is exact: what lies below the ground's surface of a link is a segment, and the hole is convex, so the
-    two ends of that segment tell whether all of it is in the hole.
+    The test is exact: the part of a link below the surface is a segment, and the hole is convex, so the
+    segment is in the hole if both its ends are.
 
     Args:
-        points: Ends of the links, m; the ground's surface is y = 0, and touching it is no collision.
+        points: Ends of the links, m; the surface of the ground is y = 0, and contact with it is no collision.
         center: Middle of the hole, m.
         width: Width of the hole, m.
         depth: Depth of the hole, m.
@@ -201,18 +202,18 @@ def hits_ground(
     """
     begin, end = points[:-1], points[1:]
     rise = end[:, 1] - begin[:, 1]
-    # Where the link passes y = 0; without a pass neither value is used.
+    # Where the link crosses y = 0. Without a crossing both values are unused.
     share = -begin[:, 1] / jnp.where(rise == 0.0, 1.0, rise)
     crossing = begin[:, 0] + share * (end[:, 0] - begin[:, 0])
     is_below = points[:, 1] < 0.0
-    passes = is_below[:-1] != is_below[1:]
+    crosses = is_below[:-1] != is_below[1:]
     is_in_hole = (jnp.abs(points[:, 0] - center) <= 0.5 * width) & (points[:, 1] >= -depth)
     crosses_in_hole = jnp.abs(crossing - center) <= 0.5 * width
-    return jnp.any(is_below & ~is_in_hole) | jnp.any(passes & ~crosses_in_hole)
+    return jnp.any(is_below & ~is_in_hole) | jnp.any(crosses & ~crosses_in_hole)
 
 
-def _tuples(*ends: VectorLike) -> tuple[tuple[float, ...], ...]:
-    return tuple(tuple(np.ravel(np.asarray(end, float)).tolist()) for end in ends)
+def _tuple(ends: VectorLike) -> tuple[float, ...]:
+    return tuple(np.ravel(np.asarray(ends, float)).tolist())
 
 
 def _dmp_parameters(*, num_goals: int) -> Space:

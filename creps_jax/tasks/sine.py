@@ -1,4 +1,4 @@
-"""The smallest task: one parameter that should be the sine of one context."""
+"""The smallest task: one parameter, whose optimum is the sine of one context."""
 
 import math
 
@@ -15,21 +15,21 @@ __all__ = ["sinus"]
 
 @checks.arguments
 def sinus(low: float = 0.0, high: float = 5 * math.pi) -> Task:
-    """Ask for theta = sin(context), with reward -(theta - sin s)^2.
+    """Make the sine task: the optimum is theta = sin(context), the reward -(theta - sin s)^2.
 
-    The paper's figure gives the range of contexts as "[0.05PI]", which has lost a character. Read as
-    0 to 5 pi, a linear policy fails, as the paper reports; over 0 to pi / 2 the sine is so
-    straight that a linear policy would do.
+    The paper's figure gives the range of contexts as "[0.05PI]", in which a character is missing. With the
+    range 0 to 5 pi a linear policy fails, as the paper reports; from 0 to pi / 2 the sine is almost straight,
+    and a linear policy suffices.
 
     Args:
         low: Lower end of the contexts, in radians.
         high: Upper end of the contexts, in radians.
 
     Returns:
-        A task of one context, Gaussian over the range, and one parameter.
+        A task with one context, Gaussian over the range, and one parameter.
 
     Raises:
-        ValueError: If `low` is not below `high`, or one of them is no number.
+        ValueError: If `low` is not below `high`, or one of them is not a number.
 
     Source: Abdolmaleki et al. 2016, Section 4.1 and Fig. 5 (the reward is printed without its minus).
     """
