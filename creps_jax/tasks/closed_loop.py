@@ -44,7 +44,7 @@ _LONGEST = 3600.0
 class WalkNoise(NamedTuple):
     """Standard deviations of the noise on measured angles, set-points and joints at the start, rad.
 
-    The noise is white: each control step draws new values.
+    The noise is white: it is sampled anew in each control step.
     """
 
     lean: float = 0.01
@@ -94,7 +94,7 @@ class PlannedWalk(NamedTuple):
         lean_noise: Noise on the measured roll, pitch and yaw, rad.
         set_point_noise: Noise on the set-points, at the start of the first control step (zero) and at the
             end of each, rad.
-        circumstances: What the robot meets; None for the model's own world.
+        circumstances: Values of the conditions; None without conditions.
     """
 
     params: WalkParams
@@ -156,7 +156,7 @@ def check_numbers(name: str, record: Any, *, least: float = -math.inf) -> None:
 def plan(
     setup: WalkSetup, key: PRNGKey, theta: Float[Array, "10"], values: Float[Array, " k"]
 ) -> tuple[PlannedWalk, WalkState]:
-    """Plan a walk from standstill, and draw its noise.
+    """Plan a walk from standstill, and sample its noise.
 
     Args:
         setup: What is fixed for the task.
@@ -194,6 +194,9 @@ def advance(setup: WalkSetup, walk: PlannedWalk, tick: IntScalar, state: WalkSta
         walk: What is fixed for the walk.
         tick: Number of the control step, from 0.
         state: State before it.
+
+    Returns:
+        The state after it.
     """
     robot, set_point = state
     pose, lean_noise = jax.tree.map(lambda leaf: leaf[tick], (walk.poses, walk.lean_noise))

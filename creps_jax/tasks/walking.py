@@ -245,9 +245,8 @@ def _walk_to_end(setup: WalkSetup, walk: PlannedWalk, start: WalkState, start_up
     def step(progress: _Progress) -> _Progress:
         # A batch continues until all its robots have finished. A state of NaN makes C MuJoCo skip a robot
         # that has fallen.
-        nan_if_fallen = lambda x: jnp.where(progress.has_fallen, jnp.nan, x)  # noqa: E731
-        state = progress.state._replace(robot=jax.tree.map(nan_if_fallen, progress.state.robot))
-        state = advance(setup, walk, progress.tick, state)
+        robot = jax.tree.map(lambda x: jnp.where(progress.has_fallen, jnp.nan, x), progress.state.robot)
+        state = advance(setup, walk, progress.tick, progress.state._replace(robot=robot))
         tick = progress.tick + 1
         is_start_up = tick <= start_up_ticks
         measured_from = lax.select(is_start_up, state.robot.qpos[:2], progress.measured_from)
