@@ -210,8 +210,9 @@ def penalised(task: Task, low: VectorLike, high: VectorLike, penalty: float | in
 def _bounded(parameters: Space | None, low: np.ndarray, high: np.ndarray, constraint: str) -> Space | None:
     if parameters is None:
         return None
-    low, high = tuple(low.tolist()), tuple(high.tolist())
-    return dataclasses.replace(parameters, low=low, high=high, constraint=constraint)
+    return dataclasses.replace(
+        parameters, low=tuple(low.tolist()), high=tuple(high.tolist()), constraint=constraint
+    )
 
 
 def _mean_of_repeats(field: Array) -> Array:
