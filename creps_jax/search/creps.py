@@ -499,8 +499,7 @@ def _update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) ->
     """Fit a new policy to the archive."""
     samples, history = _samples(settings, state)
     features, baseline, theta, reward, resolution, prior, is_valid = samples
-    given = reward, baseline, prior
-    dual, weights = solve_and_weigh(*given, kl_bound=kl_bound, resolution=resolution)
+    dual, weights = solve_and_weigh(reward, baseline, prior, kl_bound, resolution=resolution)
     kind, old = settings.kind, state.policy
     fitted = kind.fit(old, WeightedSamples(features, theta, weights, is_valid))
 
