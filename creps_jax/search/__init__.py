@@ -1,1 +1,1 @@
-"""How to search: contextual REPS, from rewards to a new policy."""
+"""Search methods: contextual REPS, from rewards to a new policy."""

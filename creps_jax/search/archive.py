@@ -1,4 +1,7 @@
-"""Keep the last L samples in a ring buffer of fixed shape (Abdolmaleki et al. 2016, Section 4)."""
+"""Keep the last L samples in a ring buffer of fixed shape (Abdolmaleki et al. 2016, Section 4).
+
+Rewards that are more precise than the archive are stored as a rounded value and a remainder.
+"""
 
 from typing import NamedTuple
 
@@ -14,11 +17,11 @@ __all__ = ["Archive", "Batch", "centred_reward", "empty_archive", "push", "split
 
 
 _ROUNDING = 1.75
-"""Largest error that counts as rounding, in units of the precision: a sum of a few terms has as much."""
+"""Largest rounding error of a sum of a few terms, in units of their precision."""
 
 
 class Batch(NamedTuple):
-    """Samples as they were drawn and measured; those with anything non-finite carry no information."""
+    """Samples as drawn and measured; a sample with a value that is not finite is not used."""
 
     context: Float[Array, "n s"]
     theta: Float[Array, "n d"]
@@ -29,15 +32,15 @@ class Archive(NamedTuple):
     """The last L samples, where `batch` has L slots.
 
     Attributes:
-        batch: The slots, in no particular order of age. Slots never written, and numbers of a sample that
-            were not finite, hold zeros.
-        next_index: The slot that the next sample goes to.
-        size: How many slots have been written, at most L.
-        age: How many batches were pushed after that of each slot.
-        is_valid: Which slots hold a sample that was finite throughout.
-        reward_rest: What the rounding of each reward to the precision of the archive has left out: float64
-            rewards in an archive of float32 keep their differences beside a large offset.
-        reward_rounding: How exact each reward is: the rounding error of the precision in which it was given.
+        batch: The slots, not ordered by age. Slots never written, and values that were not finite, hold
+            zeros.
+        next_index: The slot of the next sample.
+        size: Number of slots that have been written, at most L.
+        age: Number of batches that were pushed after the batch of each slot.
+        is_valid: Which slots hold a sample whose values were all finite.
+        reward_rest: Each given reward minus its value in the precision of the archive: float64 rewards keep
+            their differences in a float32 archive even with a large common offset.
+        reward_rounding: Rounding error of each reward in the format in which it was given.
     """
 
     batch: Batch
@@ -53,10 +56,10 @@ class Archive(NamedTuple):
 def empty_archive(
     archive_size: int, context_dim: int, theta_dim: int, dtype: DTypeLike = jnp.float32
 ) -> Archive:
-    """Make an archive of `archive_size` empty slots, whose numbers have the given precision.
+    """Make an archive of `archive_size` empty slots, with numbers in the given precision.
 
     Raises:
-        ValueError: If `archive_size` is no whole number of at least 1.
+        ValueError: If `archive_size` is not a whole number of at least 1.
     """
     numbers = jnp.zeros(archive_size, dtype)
     zero = jnp.zeros((), jnp.int32)
@@ -81,17 +84,16 @@ def push(
     reward_rest: Float[Array, " n"] | None = None,
     reward_eps: ScalarLike | None = None,
 ) -> Archive:
-    """Add a batch of samples, each in the place of the oldest once the archive is full.
+    """Add a batch of samples, which replace the oldest ones once the archive is full.
 
-    Of a batch larger than the archive its last L samples stay, as if they were added one by one.
+    If the batch is larger than the archive, its last L samples stay, as if they were added one by one.
 
     Args:
-        archive: Where to add them.
+        archive: The archive.
         batch: The samples, in the precision of the archive.
-        reward_rest: What the rounding of the rewards to that precision has left out, see `split_reward`;
-            nothing by default.
-        reward_eps: Machine epsilon of the format in which the rewards were given; by default that of the
-            archive.
+        reward_rest: Given rewards minus their values in that precision, see `split_reward`; zero by default.
+        reward_eps: Machine epsilon of the format in which the rewards were given; by default the format of
+            the archive.
 
     Returns:
         The new archive.
@@ -101,7 +103,7 @@ def push(
     first_kept = max(0, num_new - archive_size)
     slots = (archive.next_index + jnp.arange(first_kept, num_new, dtype=jnp.int32)) % archive_size
     is_finite = _is_finite(batch)
-    # No NaN stays: it would end a program in which jax looks out for them (`jax_debug_nans`).
+    # NaN would stop a program that runs with `jax_debug_nans`.
     batch = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, jnp.zeros_like(x)), batch)
     eps = jnp.finfo(batch.reward.dtype).eps
     rest = jnp.zeros_like(batch.reward)
@@ -127,32 +129,32 @@ def push(
 def split_reward(
     reward: Array | np.ndarray, dtype: DTypeLike
 ) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """Split rewards into a part in the precision of an archive, and the rest where they are more precise.
+    """Split rewards into a value in the precision of an archive, and a remainder.
 
     Args:
-        reward: Rewards (n,), of any precision; those of NumPy are split by NumPy, before jax narrows them.
+        reward: Rewards (n,), of any precision; NumPy splits NumPy arrays, before jax narrows them.
         dtype: The precision of the archive.
 
     Returns:
-        Rewards and rest; their sum is the given reward to about twice the digits.
+        Rounded rewards and remainders; their sum is the given reward, to about twice as many digits.
     """
-    # What is too large for the format becomes infinite: such a sample is not valid.
+    # A reward too large for the format becomes infinite, and its sample is not valid.
     with np.errstate(over="ignore", invalid="ignore"):
         rounded = reward.astype(dtype)
         return rounded, (reward - rounded.astype(reward.dtype)).astype(dtype)
 
 
 def centred_reward(archive: Archive) -> tuple[Float[Array, " L"], Scalar]:
-    """Return the rewards less the largest of the valid ones, and the largest rounding error of one of them.
+    """Return the rewards minus the largest valid one, and the largest rounding error of a reward.
 
-    Subtracting the largest changes no weight of a sample. It is done here, before the rest of the rewards is
-    lost in their rounding. Rewards of slots that are not valid are zero.
+    The subtraction changes no weight of a sample. It uses the remainders, which a sum of reward and remainder
+    would lose. Rewards of slots that are not valid are zero.
     """
     reward, rest, is_valid = archive.batch.reward, archive.reward_rest, archive.is_valid
     largest = jnp.max(jnp.where(is_valid, reward, -jnp.inf))
     rest_of_largest = jnp.max(jnp.where(is_valid & (reward == largest), rest, -jnp.inf))
     largest, rest_of_largest = (jnp.where(jnp.any(is_valid), x, 0.0) for x in (largest, rest_of_largest))
-    # By halves: a difference of finite numbers may be infinite.
+    # Half of each: the difference of two finite numbers may be infinite.
     limit = 0.5 * jnp.finfo(reward.dtype).max
     halves = jnp.maximum(0.5 * reward - 0.5 * largest, -limit)
     difference = 2.0 * halves + (rest - rest_of_largest)

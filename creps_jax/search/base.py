@@ -1,4 +1,4 @@
-"""What a search is to those who run it: four functions, and no more."""
+"""The interface between a search and `creps_jax.train`: a record of four functions."""
 
 import dataclasses
 import functools
@@ -17,11 +17,11 @@ __all__ = ["Search", "SearchState"]
 
 @runtime_checkable
 class SearchState(Protocol):
-    """The state of a search: any pytree of arrays with the number of batches that it has been told."""
+    """The state of a search: any pytree of arrays with the number of batches told so far."""
 
     @property
     def iteration(self) -> IntScalar:
-        """How many batches have been told; zero after `init`."""
+        """Number of batches told so far; zero after `init`."""
         ...
 
 
@@ -29,8 +29,8 @@ class SearchState(Protocol):
 class Search(KeepsPrograms):
     """A search as a record of pure functions, closed over and never traced.
 
-    All of them may be jitted and vmapped; shapes are n samples, s context variables, d parameters. This is
-    all that `creps_jax.train` knows of a search: one of your own needs no more.
+    All of them can be jitted and vmapped. Shapes: n samples, s context variables, d parameters.
+    `creps_jax.train` uses only these functions, so that it runs any search that has them.
 
     Attributes:
         init: (policy) -> state, a `SearchState`.
@@ -56,15 +56,15 @@ class Search(KeepsPrograms):
 
     @functools.cached_property
     def programs(self) -> dict[Any, Any]:
-        """Compiled programs that are made of this search, such as iterations."""
+        """Compiled programs that contain this search, such as iterations."""
         return {}
 
     @property
     def traced(self) -> Any:
-        """Settings that compiled programs take as an argument: another value compiles nothing anew."""
+        """Settings that are arguments of compiled programs: another value compiles nothing anew."""
         return ()
 
     def with_traced(self, traced: Any) -> "Search":
-        """Return the search with other values of these settings, which may be traced."""
+        """Return the search with other values of these settings, traced ones included."""
         del traced
         return dataclasses.replace(self)

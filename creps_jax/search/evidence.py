@@ -1,9 +1,8 @@
-"""Judge by a significance test whether rewards say anything about the parameters.
+"""Test whether rewards depend on the parameters, so that noise alone does not reduce the exploration.
 
-The covariance that is fitted to weighted samples is smaller than that of the samples even where the weights
-are noise: fewer samples carry the weight, and the logarithm of a sample covariance is biased downwards. A
-search that takes this for success loses its exploration. So the covariance of the policy moves in proportion
-to the evidence that weights and parameters depend on each other.
+A covariance fitted to weighted samples is too small even if the weights are noise: fewer samples carry the
+weight, and the logarithm of a sample covariance is biased downwards. Therefore the covariance of the policy
+moves in proportion to the evidence that weights and parameters depend on each other.
 """
 
 import math
@@ -18,9 +17,9 @@ from creps_jax.typing import Array, Float, Scalar, ScalarLike
 __all__ = ["independence_p_value", "share_of_evidence"]
 
 _LEAST_VARIANCE = 1e-4
-"""Squares of whitened parameters, which have a variance of 2 if Gaussian, are constant below this one."""
+"""Variance below which squares of whitened parameters count as constant; if Gaussian, they have 2."""
 _ROUNDING = 64.0
-"""Spread of a column, in units of the rounding of its mean, that may be rounding of its sums."""
+"""Largest spread of a constant column by rounding of its sums, in units of the rounding of its mean."""
 _NUM_TESTS = 3
 
 
@@ -32,24 +31,24 @@ def independence_p_value(
 ) -> Scalar:
     """Test whether the weights of samples are independent of their parameters, given the context.
 
-    Three tests, of which the most significant counts, times three (Bonferroni). Parameters are whitened
+    The result is the smallest p-value of three tests, times three (Bonferroni). Parameters are whitened
     after a regression on the features of the context. Two F-tests regress the change of the weights on the
-    parameters and on their squares; a chi-squared test asks whether the samples that gain weight lie closer
-    to each other than all do. p-values far below 0.01 are approximate, as weights are not Gaussian.
+    parameters and on their squares. A chi-squared test checks whether the samples that gain weight lie closer
+    to each other than all samples do. p-values far below 0.01 are approximate, as weights are not Gaussian.
 
     Args:
         weights: Weights d of the samples that follow from their rewards; they sum to one.
-        prior: Weights before rewards were seen, such as those of importance; zero where a sample does not
+        prior: Weights before rewards were seen, such as importance weights; zero where a sample does not
             count. Their scale does not matter.
-        features: Policy features of the contexts. Rows that do not count have to be finite.
-        theta: Parameters, likewise, or what a policy has added to its mean: a linear function of features and
-            parameters tests the same. A parameter is left out if the features and the parameters before it
-            explain all but about 1 % of its standard deviation (in float32).
+        features: Policy features of the contexts. Rows of samples that do not count must be finite, too.
+        theta: Parameters, likewise, or the noise that a policy has added to its mean: the result is the same
+            for any linear function of parameters and features. A parameter is left out if the features and
+            the parameters before it explain all but about 1 % of its standard deviation (in float32).
 
     Returns:
-        The p-value, how likely a dependence as strong as this one is where there is none. It is 1 where there
-        are too few samples to test for it, no more than features and parameters, or where no weight differs
-        from that of before.
+        The p-value: the probability of a dependence at least this strong if there is none. It is 1 if there
+        are too few samples for a test, no more than features and parameters, or if all weights equal the
+        prior.
 
     Source: Fisher 1925, Statistical methods for research workers (analysis of variance).
     """
@@ -71,11 +70,11 @@ def independence_p_value(
 
 
 def share_of_evidence(p_value: ScalarLike, significance: float) -> Scalar:
-    """Return the fraction of its way that the covariance moves, from 0 to 1.
+    """Return the fraction of the way to the fitted covariance that the covariance moves, from 0 to 1.
 
     Args:
         p_value: From `independence_p_value`, from 0 to 1.
-        significance: The p-value, above 0, from which on it does not move.
+        significance: Least p-value, above 0, at which the covariance does not move.
     """
     return jnp.clip(1.0 - p_value / significance, 0.0, 1.0)
 
@@ -90,17 +89,17 @@ def _whitened(prior: Array, features: Array, theta: Array) -> tuple[Array, Array
     """
     counts = (prior > 0)[:, None]
     columns = jnp.where(counts, jnp.concatenate([features, theta], axis=1), 0.0)
-    # Squares of the columns have to stay within the format, whatever their units.
+    # Squares of the columns must not overflow, whatever their units.
     size = jnp.max(jnp.abs(columns), axis=0)
     columns = columns / jnp.where(size > 0, size, 1.0)[None, :]
     means = weighted_mean(columns, prior)
     columns = jnp.where(counts, columns - means[None, :], 0.0)
     products = exact_dot(columns.T, prior[:, None] * columns)
     eps, spread = jnp.finfo(columns.dtype).eps, safe_sqrt(jnp.diagonal(products))
-    # What is constant up to rounding becomes zero; the others are scaled to a spread of one.
+    # Columns that are constant up to rounding become zero; the others are scaled to a spread of one.
     is_spread = spread > _ROUNDING * eps * jnp.abs(means)
     unit = jnp.where(is_spread, 1.0 / jnp.where(is_spread, spread, 1.0), 0.0)
-    # One factorisation regresses and whitens, as it frees each column of those before it.
+    # One factorisation regresses and whitens: it makes each column uncorrelated with those before it.
     identity, rounding = jnp.eye(unit.size, dtype=unit.dtype), 4.0 * unit.size * eps
     factor = jnp.linalg.cholesky(unit[:, None] * products * unit[None, :] + rounding * identity)
     is_independent = is_spread & (jnp.diagonal(factor) > 2.0 * rounding**0.5)
@@ -118,7 +117,7 @@ def _whitened(prior: Array, features: Array, theta: Array) -> tuple[Array, Array
 
 
 def _explained(change: Array, prior: Array, columns: Array) -> Array:
-    """Return the part of `change / prior` that each column explains, once it has mean zero and spread one."""
+    """Return the part of `change / prior` that each column explains, standardised."""
     means = exact_dot(jnp.stack([change, prior]), columns)
     spread = exact_dot(prior, columns**2) - means[1] ** 2
     covariance = means[0] - jnp.sum(change) * means[1]
@@ -129,7 +128,7 @@ def _explained(change: Array, prior: Array, columns: Array) -> Array:
 def _regression_p_value(explained: Array, total: Scalar, num_regressors: Scalar, freedom: Scalar) -> Scalar:
     """Return the p-value of the F-test that no regressor explains `change / prior`.
 
-    Regressors are standardised and nearly uncorrelated. `freedom` is what samples have without them.
+    Regressors are standardised and nearly uncorrelated. `freedom` is the degrees of freedom without them.
     """
     r_squared = jnp.clip(jnp.sum(explained) / jnp.where(total > 0, total, 1.0), 0.0, 1.0)
     rest = freedom - num_regressors
@@ -143,13 +142,13 @@ def _regression_p_value(explained: Array, total: Scalar, num_regressors: Scalar,
 def _concentration_p_value(
     change: Array, prior: Array, features: Array, noise: Array, num_features: Scalar, num_directions: Scalar
 ) -> Scalar:
-    """Return the p-value of the chi-squared test that the samples that gain weight are as spread as all.
+    """Return the p-value of the chi-squared test that samples that gain weight have the common spread.
 
-    Few samples that lie close to each other are evidence, which regressions on all samples hardly see.
+    A few samples that lie close to each other are evidence that regressions on all samples hardly detect.
     """
     gain = jnp.maximum(change, 0.0)
     gain = gain / jnp.where(jnp.any(gain > 0), jnp.sum(gain), 1.0)
-    # What is left of them after a regression on the features, by the products of all columns.
+    # Their spread after a regression on the features, from the products of all columns.
     columns = jnp.concatenate([jnp.ones_like(gain)[:, None], features, noise], axis=1)
     products = exact_dot(columns.T, gain[:, None] * columns)
     size = 1 + features.shape[1]
@@ -163,7 +162,7 @@ def _concentration_p_value(
     rest = num_samples - num_features
     sizes = jnp.sum(noise**2, axis=1)
     variance = exact_dot(prior, (sizes - num_directions) ** 2)
-    # Sizes that vary more than those of a Gaussian say less: those of a mixture of policies do.
+    # Fewer degrees of freedom if sizes vary more than for a Gaussian, as for a mixture of policies.
     freedom = (
         rest
         * num_directions

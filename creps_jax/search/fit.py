@@ -1,8 +1,11 @@
-"""Fit the next policy to weighted samples: as the paper does, or with bounds on how far it moves.
+"""Fit the next policy to weighted samples: Eq. 14 and 15 of the paper, or with bounds on its change.
 
-The bound of contextual REPS holds for the weights of the samples. The Gaussian that is fitted to them
-moves farther: with 50 samples of 20 parameters by some 10 nats where 1 was allowed, mostly because too
-few samples say too much about the covariance. The bounded fit keeps the promise.
+The bound of contextual REPS limits the weights of the samples. The Gaussian that is fitted to them moves
+farther, for 50 samples of 20 parameters about 10 nats with a bound of 1, mostly because few samples determine
+the covariance badly. `bounded_ml` bounds the change of the Gaussian itself.
+
+Both fits get the mean by `policies.regression.regress` (Eq. 14). The covariance (Eq. 15) is computed in
+`policies.gaussian` for `weighted_ml`, and in `BoundedML` for `bounded_ml`.
 """
 
 import dataclasses
@@ -22,7 +25,7 @@ from creps_jax.typing import Array, Float, Scalar, ScalarLike
 __all__ = ["MStep", "bounded_ml", "fit_within", "weighted_ml"]
 
 _LOG_MULTIPLIERS = (-12.0, 40.0)
-"""Range of the logarithms of the multipliers: below, a bound changes nothing; above, nothing moves."""
+"""Range of the logarithm of a multiplier: at the lower end it has no effect, at the upper nothing moves."""
 _NUM_TRIALS, _NUM_REFINEMENTS = 32, 4
 
 
@@ -38,7 +41,10 @@ def weighted_ml(
     ridge: ScalarLike,
     scale: Float[Array, " p"] | None = None,
 ) -> LinearGaussian:
-    """Fit by weighted maximum likelihood, wherever that leads: `fit_weighted_ml` from the old policy on."""
+    """Fit by weighted maximum likelihood without bounds: `fit_weighted_ml`, starting from the old policy.
+
+    Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
+    """
     features, theta, weights, _, constant = samples
     return fit_weighted_ml(
         features, theta, weights, ridge=ridge, scale=scale, start=policy.coef, constant=constant
@@ -49,38 +55,37 @@ def weighted_ml(
 def bounded_ml(
     *, mean_kl_bound: float = 1.0, cov_kl_bound: float = 0.05, entropy_loss_bound: float | None = None
 ) -> MStep:
-    """Make the fit by weighted maximum likelihood with bounds on how far mean and covariance move.
+    """Make the fit by weighted maximum likelihood with bounds on the change of mean and covariance.
 
-    The relative entropy of the new policy to the old one, averaged over the contexts, is a sum of a part of
-    the mean and a part of the covariance:
-    `E_s KL = E_s |shift of the mean|^2 / 2 + (tr X - log det X - d) / 2`, both in units of the old
-    covariance, of which X is the change. Each part has its own bound. One bound on the sum would be
-    used up by the covariance, which few samples know least about, and end the search early; so does the
-    joint optimum, measured on the contextual sphere.
+    The relative entropy of the new policy to the old one, averaged over the contexts, is the sum of a mean
+    part and a covariance part: `E_s KL = E_s |shift of the mean|^2 / 2 + (tr X - log det X - d) / 2`, where
+    the shift and the new covariance X are in units of the old covariance. Each part has its own bound.
+    The covariance part, which few samples determine badly, would use up one bound on the sum and end the
+    search early; the joint optimum did the same in measurements on the contextual sphere.
 
-    The mean that is likeliest within its bound, at the old covariance, is a share `g / (g + l c)` of the
-    whole way, with a multiplier l, in features that are uncorrelated both over the contexts, with a mean
-    square c, and over the weighted samples, with a mean square g that counts the ridge. The whole way is that
-    of `weighted_ml`. The covariance that is likeliest within its bounds is, along the eigenvectors of the
-    weighted covariance s (made unbiased, as in `fit_weighted_ml`), the root x of
+    The maximum-likelihood mean within its bound, at the old covariance, moves the share `g / (g + l c)` of
+    the way to the mean of `weighted_ml`. Here l is the multiplier of the bound, and features are uncorrelated
+    both over the contexts, with mean square c, and over the weighted samples, with mean square g, which
+    includes the ridge. The maximum-likelihood covariance within its bounds has the eigenvectors of the
+    weighted covariance (unbiased, as in `fit_weighted_ml`). To its eigenvalue s belongs the root x of
     `l x^2 - (l + m - 1) x - s = 0`, where m is the multiplier of the bound on the loss of entropy. A spread
-    does not fall below the rounding of theta; one that is already below it does not fall further.
+    does not fall below the rounding error of theta; a spread that is already below it does not fall further.
 
     Args:
-        mean_kl_bound: Largest part of the mean in the relative entropy, nats.
-        cov_kl_bound: Largest part of the covariance, nats.
-        entropy_loss_bound: Largest loss of differential entropy, nats; by default only `cov_kl_bound`
+        mean_kl_bound: Largest mean part of the relative entropy, in nats.
+        cov_kl_bound: Largest covariance part, in nats.
+        entropy_loss_bound: Largest loss of differential entropy, in nats; by default only `cov_kl_bound`
             limits it.
 
     Returns:
-        The M-step. Where a bound is active, the policy meets it; the sum of the first two bounds the
-        relative entropy.
+        The M-step. An active bound is met with equality; the sum of the first two bounds limits the relative
+        entropy.
 
     Raises:
         ValueError: If a bound is not a positive number.
 
-    Source: The parts are bounded apart as in Abdolmaleki et al. 2018, Maximum a posteriori policy
-    optimisation, Section 4.2.1; here in the other direction of the relative entropy, and exact.
+    Source: Separate bounds as in Abdolmaleki et al. 2018, Maximum a posteriori policy optimisation,
+    Section 4.2.1; here for the other direction of the relative entropy, and exact.
     """
     bounds = {"mean_kl_bound": mean_kl_bound, "cov_kl_bound": cov_kl_bound}
     if entropy_loss_bound is not None:
@@ -101,7 +106,7 @@ def fit_within(mean_kl_bound: float | None, cov_kl_bound: float | None) -> MStep
         return weighted_ml
     if mean_kl_bound is None or cov_kl_bound is None:
         raise ValueError(
-            "mean_kl_bound and cov_kl_bound must be numbers both, or None both, "
+            "mean_kl_bound and cov_kl_bound must both be numbers or both be None, "
             f"got {mean_kl_bound} and {cov_kl_bound}"
         )
     return bounded_ml(mean_kl_bound=mean_kl_bound, cov_kl_bound=cov_kl_bound)
@@ -109,7 +114,7 @@ def fit_within(mean_kl_bound: float | None, cov_kl_bound: float | None) -> MStep
 
 @dataclasses.dataclass(frozen=True)
 class BoundedML:
-    """The M-step of `bounded_ml`: its bounds as data, which can be compared and pickled."""
+    """The M-step of `bounded_ml` as a record of its bounds, which can be compared and pickled."""
 
     mean_kl_bound: float
     cov_kl_bound: float
@@ -144,19 +149,19 @@ class BoundedML:
 def _bounded_change(
     fit: Regression, old_chol: Float[Array, "d d"], samples: WeightedSamples, kl_bound: float
 ) -> tuple[Float[Array, "q d"], Scalar]:
-    """Go from the old mean towards the likeliest one, as far as the bound allows.
+    """Move from the old mean towards the maximum-likelihood mean, as far as the bound allows.
 
     Returns:
         The change in the coordinates of the regression, and the normaliser of its residuals.
     """
     contexts = _context_rows(fit, samples)
-    # Both what holds the likeliest mean and what the bound is on can be tiny in a direction, as that of a
-    # radial basis function beyond all contexts; with the ridge in the first, their sum is not.
+    # Both matrices can be tiny in a direction, such as a radial basis function far from all contexts; their
+    # sum is not, as the first includes the ridge.
     basis = jnp.linalg.qr(jnp.concatenate([fit.root, contexts]), mode="r")
     held, contexts, rows = (divided(columns, basis) for columns in (fit.root, contexts, fit.rows))
     _, axes = jnp.linalg.eigh(exact_dot(contexts.T, contexts))
     hold, use = (jnp.sum(exact_dot(columns, axes) ** 2, axis=0) for columns in (held, contexts))
-    # The whole way: in units of the old covariance, for features along the axes.
+    # The whole way to the maximum-likelihood mean, in units of the old covariance, along the axes.
     change = fit.solution.at[0].add(fit.centre)
     change = jax.scipy.linalg.solve_triangular(old_chol, change.T, lower=True).T
     way = exact_dot(axes.T, exact_dot(basis, change))
@@ -171,7 +176,7 @@ def _bounded_change(
     multiplier = _least_multiplier(kl, kl_bound, way.dtype)
     moved = exact_dot(axes, share(multiplier)[:, None] * way)
     moved = exact_dot(jax.scipy.linalg.solve_triangular(basis, moved), old_chol.T)
-    # The mean is linear in theta, and so are the residuals: what they have lost of the scatter of theta.
+    # Mean and residuals are linear in theta: the part of the scatter of theta that the mean has used.
     rows = exact_dot(rows, axes) / safe_sqrt(hold + multiplier * use)[None, :]
     counted = exact_dot(rows.T, fit.weights[:, None] * rows)
     used = 2.0 * jnp.trace(counted) - jnp.sum(counted * exact_dot(rows.T, rows))
@@ -179,7 +184,7 @@ def _bounded_change(
 
 
 def _context_rows(fit: Regression, samples: WeightedSamples) -> Float[Array, "n q"]:
-    """Return coordinates whose sums of squares are means over the contexts that count."""
+    """Return coordinates whose sums of squares are mean squares over the contexts that count."""
     counts = samples.is_valid & jnp.all(jnp.isfinite(samples.features), axis=1)
     rows = coordinates(fit.basis, jnp.where(counts[:, None], samples.features, 0.0))
     num = jnp.maximum(jnp.sum(counts, dtype=rows.dtype), 1.0)
@@ -189,12 +194,12 @@ def _context_rows(fit: Regression, samples: WeightedSamples) -> Float[Array, "n 
 def _bounded_factor(
     scatter: Float[Array, "d d"], kl_bound: float, entropy_loss_bound: float | None
 ) -> Float[Array, "d d"]:
-    """Go from a covariance I towards a weighted one, as far as the bounds allow; return a root of it."""
+    """Move from the covariance I towards `scatter`, as far as the bounds allow; return a square root."""
     spread, axes = jnp.linalg.eigh(0.5 * (scatter + scatter.T))
     excess = jnp.maximum(spread, 0.0) - 1.0
 
     def change(kl_multiplier: Array, entropy_multiplier: Array) -> Array:
-        """Return x - 1, without its cancellation; where both multipliers are zero it is s - 1."""
+        """Return x - 1 without cancellation; s - 1 where both multipliers are zero."""
         middle = 1.0 + kl_multiplier - entropy_multiplier
         pull = excess + entropy_multiplier
         root = jnp.sqrt(jnp.maximum(middle**2 + 4.0 * kl_multiplier * pull, 0.0))
@@ -219,21 +224,21 @@ def _bounded_factor(
 
 
 def _as_cov_chol(root: Float[Array, "d d"], old_chol: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """Return the Cholesky factor of a covariance whose root is given, for parameters of size one."""
+    """Return the Cholesky factor of a covariance with this square root, for parameters of size one."""
     upper = jnp.linalg.qr(root.T, mode="r")
     cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
-    # Below the rounding of theta a spread means nothing, and would shrink to zero. One that is already
-    # there may stay: to raise it would break the bounds.
+    # A spread below the rounding error of theta has no effect, and would shrink to zero. A spread that is
+    # already below stays: raising it would violate the bounds.
     least = jnp.minimum(4.0 * jnp.finfo(cov_chol.dtype).eps, jnp.linalg.norm(old_chol, axis=1))
     return cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]
 
 
 def _least_multiplier(move: Callable[[Array], Scalar], bound: float, dtype: jnp.dtype) -> Array:
-    """Return the least multiplier at which what is bounded, and falls with it, is within its bound."""
+    """Return the least multiplier for which `move`, which falls with it, is within the bound."""
     low, high = (jnp.asarray(end, dtype) for end in _LOG_MULTIPLIERS)
     shares = jnp.linspace(0.0, 1.0, _NUM_TRIALS + 1, dtype=dtype)
 
-    # Many values at once and few rounds of them: small operations cost more than large ones.
+    # Many trials at once in few rounds: the number of operations costs more than their size.
     def refine(ends: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         low, high = ends
         trials = low + shares * (high - low)

@@ -1,4 +1,7 @@
-"""Importance weights of archived samples: how much each says about the current policy."""
+"""Importance weights of archived samples: the density under the current policy over that when drawn.
+
+A history holds the last K policies, each of which may have drawn archived samples.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -15,21 +18,21 @@ from creps_jax.typing import Array, Bool, Float, Int, IntScalar
 __all__ = ["Importance", "empty_history", "importance_weights", "remember"]
 
 _LEAST_LOG_POWER, _NUM_HALVINGS = -30.0, 25
-"""Where the search for the power that keeps enough effective samples begins, and its bisections."""
+"""Lower end of the search for the power that leaves enough effective samples, and number of bisections."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Importance:
-    """How to weigh archived samples by importance.
+    """Settings of the importance weights of archived samples.
 
-    Meant for `bounded_ml`: weights leave fewer effective samples, of which the unbounded fit makes a policy
-    that narrows too soon.
+    Meant for `bounded_ml`: importance weights reduce the effective number of samples, and with few of them
+    the unbounded fit narrows the policy too soon.
 
     Attributes:
-        num_policies: Number K of the last policies that are kept. Samples of older ones are left out: an
-            archive of L samples, told N at a time, holds those of L / N policies.
-        least_effective: Effective number of samples that weights have to leave, of those that there are.
-            Where there would be fewer, all weights are raised to the power, from 0 to 1, that leaves as many.
+        num_policies: Number K of the last policies that are kept. Samples of older policies are left out. An
+            archive of L samples, told N at a time, holds samples of L / N policies.
+        least_effective: Least effective number of samples. If the weights leave fewer, all weights are raised
+            to the power, from 0 to 1, that leaves this number, or as many as there are.
     """
 
     num_policies: int = 20
@@ -42,15 +45,15 @@ class Importance:
 
 
 def empty_history(policy: Any, num_policies: int) -> Any:
-    """Make a history, whose arrays have a first axis of places, that all hold this policy.
+    """Make a history: arrays with a first axis of places, all of which hold this policy.
 
-    No sample is of it before it is remembered.
+    No sample is attributed to a place before `remember` has written it.
     """
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num_policies, *leaf.shape)), policy)
 
 
 def remember(history: Any, policy: Any, iteration: IntScalar) -> Any:
-    """Put the policy of an iteration in the place of the oldest: that of iteration t in the place t mod K."""
+    """Replace the oldest policy by the policy of this iteration t, at the place t mod K."""
     place = iteration % jax.tree.leaves(history)[0].shape[0]
     return jax.tree.map(lambda past, new: past.at[place].set(new), history, policy)
 
@@ -67,25 +70,25 @@ def importance_weights(
     *,
     least_effective: float,
 ) -> Float[Array, " n"]:
-    """Weigh samples by the density of a policy over that of the mixture they were drawn from.
+    """Weigh samples by the density of a policy over the density of the mixture they were drawn from.
 
-    Against the mixture (the balance heuristic) the weight of a sample of this very policy is at most the
-    number of all samples over the number of its own: no sample of an old policy outweighs all others.
+    With the mixture as denominator (the balance heuristic) the ratio is at most the number of all samples
+    over the number of samples of this policy: no sample of an old policy outweighs all others.
 
     Args:
         log_prob: (policy, features, theta) -> log densities (n,), see `Policy`.
-        policy: What samples are wanted of, such as the policy that the last ones were drawn from.
-        history: The last K policies, that of `iteration` included.
+        policy: The target of the weights, such as the policy that drew the last samples.
+        history: The last K policies, including the policy of `iteration`.
         features: Policy features of the contexts.
         theta: Parameters.
-        age: How many iterations before `iteration` a sample was drawn.
-        is_valid: Which samples count; what the others hold has to be finite.
+        age: Number of iterations between the draw of a sample and `iteration`.
+        is_valid: Which samples count; the values of the others must be finite, too.
         iteration: The number of the last iteration.
         least_effective: See `Importance`.
 
     Returns:
         Weights that sum to one, zero where a sample does not count or its policy is no longer kept; all
-        zero if none does.
+        zero if no sample counts.
 
     Source: Veach and Guibas 1995, the balance heuristic.
     """
@@ -104,12 +107,12 @@ def importance_weights(
 
 
 def _flattened(log_weight: Array, least_effective: float) -> Array:
-    """Return the weights to the largest power, at most 1, that leaves enough effective samples."""
+    """Return the weights raised to the largest power, at most 1, that leaves enough effective samples."""
     is_counted = jnp.isfinite(log_weight)
 
     def to_the(power: Array) -> Array:
         weights = jnp.where(is_counted, jnp.exp(power * jnp.where(is_counted, log_weight, 0.0)), 0.0)
-        return weights / jnp.maximum(jnp.sum(weights), 1.0)  # the largest is one, if there is any
+        return weights / jnp.maximum(jnp.sum(weights), 1.0)  # the largest weight is one, if any sample counts
 
     def is_enough(power: Array) -> Array:
         return least_effective * jnp.sum(to_the(power) ** 2) <= 1.0
