@@ -195,7 +195,7 @@ def test_refuses_a_policy_that_does_not_fit(coef, cov_chol, message):
 
 def test_refuses_an_archive_that_no_policy_could_be_fitted_to():
     algorithm = creps(linear_features(1), quadratic_features(1), archive_size=4)
-    with pytest.raises(ValueError, match="at least 5, features and parameters, got 4"):
+    with pytest.raises(ValueError, match="at least 5, the number of features and parameters, got 4"):
         algorithm.init(LinearGaussian(jnp.zeros((2, 3)), jnp.eye(3)))
 
 

@@ -1,6 +1,7 @@
 """A search does not fool itself: no update without differences, no lost precision, no state of another."""
 
 import copy
+import dataclasses
 import gc
 import pickle
 import warnings
@@ -15,6 +16,7 @@ import creps_jax as cj
 from creps_jax.contexts import uniform_contexts
 from creps_jax.policies.features import FeatureMap, linear_features, polynomial_features, rbf_features
 from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.search import creps as creps_functions
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import creps
 from creps_jax.search.fit import bounded_ml, weighted_ml
@@ -190,6 +192,14 @@ def test_failed_measurements_pass_where_jax_looks_out_for_nan(field):
 
 
 # Programs.
+
+
+def test_functions_keep_their_documentation_and_settings():
+    for name in ("init", "ask", "tell", "policy", "mean"):
+        assert getattr(ALGORITHM, name).__doc__ == getattr(creps_functions, name).__doc__
+        replaced = dataclasses.replace(ALGORITHM, **{name: lambda *arguments: None})
+        assert replaced.settings is None and replaced.programs == {}
+    assert ALGORITHM.settings.archive_size == NUM
 
 
 def test_algorithms_are_data():

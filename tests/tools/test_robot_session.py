@@ -443,7 +443,10 @@ def broken(*path, **values) -> dict:
         (broken(mean_kl_bound=None), "must be numbers both, or null both, got None and 0.05"),
         (broken(batch_size=0), "batch_size must be from 1 to 10000, got 0"),
         (broken(batch_size=20), "archive_size must be at least batch_size, 20, got 12"),
-        (broken(archive_size=4), "archive_size must be at least 5, features and parameters, got 4"),
+        (
+            broken(archive_size=4),
+            "archive_size must be at least 5, the number of features and parameters, got 4",
+        ),
         (broken(seed=-1), "seed must be from 0 to 4294967295, got -1"),
         (broken(first_policy={"coef": [[0.0], [0.0, 1.0]], "cov_chol": [[1.0]]}), "rows of one length"),
         (broken(first_policy={"coef": [[0.0]], "cov_chol": [[1.0]]}), "do not go with first_policy"),
