@@ -95,7 +95,7 @@ def _dual_function(
     prior: Array,
     kl_bound: Array,
 ) -> Scalar:
-    """Evaluate the dual function on samples that all count, by a prior that sums to one."""
+    """Evaluate the dual function on masked samples, whose prior sums to one."""
     temperature = jnp.exp(log_temperature)
     mean_features = exact_dot(prior, features)
     advantage = (reward - exact_dot(features, baseline_coef)) / temperature

@@ -41,9 +41,9 @@ def independence_p_value(
         prior: Weights before rewards were seen, such as importance weights; zero where a sample does not
             count. Their scale does not matter.
         features: Policy features of the contexts. Rows of samples that do not count must be finite, too.
-        theta: Parameters, likewise, or the noise that a policy has added to its mean: the result is the same
-            for any linear function of parameters and features. A parameter is left out if the features and
-            the parameters before it explain all but about 1 % of its standard deviation (in float32).
+        theta: Parameters, likewise; or the noise that a policy has added to its mean, which is linear in
+            features and parameters and gives the same result. A parameter is left out if the features and the
+            parameters before it explain all but about 1 % of its standard deviation (in float32).
 
     Returns:
         The p-value: the probability of a dependence at least this strong if there is none. It is 1 if there
