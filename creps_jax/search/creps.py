@@ -99,6 +99,16 @@ class Creps(Search):
             return dataclasses.replace(self)
         return _algorithm(dataclasses.replace(self.settings, kl_bound=checked_kl_bound(traced)))
 
+    def with_settings(self, **changes: Any) -> "Creps":
+        """Return the algorithm with other values of some of the fields of `settings`.
+
+        Raises:
+            ValueError: If one of its functions was replaced, so that it has no settings.
+        """
+        if self.settings is None:
+            raise ValueError("the algorithm must be made by creps() to change its settings, got another one")
+        return _algorithm(dataclasses.replace(self.settings, **changes))
+
     def with_kl_bound(self, kl_bound: ScalarLike) -> "Creps":
         """Return the algorithm with another KL bound; nothing is compiled anew.
 

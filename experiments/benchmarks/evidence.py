@@ -14,7 +14,6 @@ from creps_jax.tools.process import prepare
 
 prepare()
 
-import dataclasses  # noqa: E402
 from pathlib import Path  # noqa: E402
 
 import jax  # noqa: E402
@@ -81,9 +80,7 @@ def measure_trade_off(trials: int = 20) -> dict[str, np.ndarray]:
         for name in TRADED:
             bench = updates.BENCHES[name](setup_key, plan)
             bounded = bench.contenders["bounded"]
-            settings = bounded.algorithm.settings
-            assert settings is not None
-            algorithm = dataclasses.replace(settings, significance=level).algorithm()
+            algorithm = bounded.algorithm.with_settings(significance=level)
             found = compare({name: bounded._replace(algorithm=algorithm)}, plan, learn_key, grid=bench.grid)
             rows.setdefault(name, []).append(mean_policy_curve(found, name)[1][:, -1])
         found = ", ".join(f"{name} {comparison.median_and_interval(row[-1])}" for name, row in rows.items())
