@@ -1,6 +1,6 @@
-"""Read the command line, `python -m experiments list | run | plot | check`.
+"""The command line `python -m experiments list | run | plot | check`.
 
-The settings of an experiment are options of `run`: tyro reads their class.
+The settings of an experiment are options of `run`: tyro makes them from the fields of their class.
 """
 
 import argparse
@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import tyro
-from tyro.conf import FlagCreatePairsOff, Positional, arg, subcommand
+from tyro.conf import Positional, arg, subcommand
 
 from creps_jax.errors import UserError
+from creps_jax.tools.arguments import parse
 from creps_jax.tools.command_line import answer, check_seed, say
 from creps_jax.tools.process import import_mjx_quietly, join_processes
 from experiments import registry
@@ -21,22 +21,24 @@ from experiments import registry
 OVERVIEW = """\
 Reproduce the figures and tables of the paper, and learn to walk.
 
-  python -m experiments list                      the experiments by name
+  python -m experiments list                      list the experiments and their presets
   python -m experiments run walk --preset quick   learn to walk, a few minutes
-  python -m experiments run walk --robot nao_h25  learn it for the real NAO's figures
-  python -m experiments run walk --resume         go on with the latest unfinished run
-  python -m experiments run walk --help           all settings of an experiment
-  python -m experiments run all                   the paper's Figures 5 to 9, half an hour
+  python -m experiments run walk --robot nao_h25  learn to walk with the model of the real NAO H25
+  python -m experiments run walk --resume         resume the latest unfinished run
+  python -m experiments run walk --help           show all settings of an experiment
+  python -m experiments run all                   run the paper's Figures 5 to 9, half an hour
   python -m experiments plot walk                 draw the figures of the latest results again
-  python -m experiments check                     hold the latest results against the paper
+  python -m experiments check                     compare the latest results with the paper's claims
 
-Results go to results/. What was learned is shown by `python -m creps_jax.tools play`.
+Results go to results/. Show a learned walk with `python -m creps_jax.tools play`.
 """
 
-_ELSEWHERE = {"video": "play", "export": "export", "session": "session", "play": "play"}
-"""Commands that people look for here, and what they are called in `creps_jax.tools`."""
+PROGRAM = "python -m experiments"
 
-# Options that are left out are described in words, not as "None".
+_ELSEWHERE = {"video": "play", "export": "export", "session": "session", "play": "play"}
+"""Commands of `creps_jax.tools`, by the names under which users look for them here."""
+
+# Defaults that are None are described in the help text.
 _Name = Annotated[str, arg(metavar="NAME")]
 _Names = Annotated[tuple[str, ...], arg(metavar="[NAME ...]", help_behavior_hint="")]
 _Text = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
@@ -46,7 +48,7 @@ _File = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="")]
 
 @dataclasses.dataclass(frozen=True)
 class List:
-    """List the experiments by name."""
+    """List the experiments with their presets."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,12 +57,12 @@ class Run:
 
     Attributes:
         name: The experiment, or "all" for the paper's Figures 5 to 9.
-        preset: Settings to begin with; each experiment's first preset by default.
-        config: The manifest.json of an earlier run, whose settings and seed to begin with instead.
+        preset: Settings preset; the first preset of the experiment by default.
+        config: The manifest.json of an earlier run: start from its settings and seed instead of a preset.
         seed: Seed of all random numbers; 0 by default.
         out: Result folder; a new one in results/ by default.
-        resume: Go on with the run in the folder --out, or with the latest unfinished one.
-        distributed: This is one of several processes, on one host or many, that share the run; see
+        resume: Resume the run in the folder --out, or the latest unfinished run.
+        distributed: This process shares the run with others, on one host or many; see
             docs/several_machines.md.
     """
 
@@ -75,7 +77,7 @@ class Run:
 
 @dataclasses.dataclass(frozen=True)
 class Plot:
-    """Draw the figures of results again.
+    """Draw the figures of a result again.
 
     Attributes:
         name: The experiment.
@@ -88,7 +90,7 @@ class Plot:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """Hold the latest results against the paper's; exit code 1 if a claim fails.
+    """Compare the latest results with the paper's claims; exit code 1 if a claim does not hold.
 
     Attributes:
         names: The experiments; all by default.
@@ -106,7 +108,7 @@ Command = (
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the arguments ask for and return the exit code, see `command_line.answer`."""
+    """Run the command of the arguments and return the exit code, see `command_line.answer`."""
     arguments = list(arguments)
     if not arguments or arguments in (["-h"], ["--help"], ["help"]):
         print(OVERVIEW, end="")
@@ -114,21 +116,14 @@ def main(arguments: Sequence[str]) -> int:
     if arguments[0] in _ELSEWHERE:
         there = _ELSEWHERE[arguments[0]]
         return answer(lambda: _refuse(f"{arguments[0]} is a command of `python -m creps_jax.tools {there}`"))
-    # What an experiment's settings are is known once it is named.
+    # The options depend on the experiment.
     if arguments[0] == "run" and len(arguments) > 1 and not arguments[1].startswith("-"):
         return answer(lambda: _run(arguments[1], arguments[2:]))
-    command = _parse(Command, arguments)
-    return answer(lambda: _HANDLERS[type(command)](command))
+    return answer(lambda: _do(parse(Command, arguments, prog=PROGRAM)))
 
 
-def _parse(kind: Any, arguments: Sequence[str], *, prog: str = "", default: Any = None) -> Any:
-    return tyro.cli(
-        kind,
-        args=list(arguments),
-        prog=f"python -m experiments{prog}",
-        config=(FlagCreatePairsOff,),
-        **({} if default is None else {"default": default}),
-    )
+def _do(command: List | Run | Plot | Check) -> int:
+    return _HANDLERS[type(command)](command)
 
 
 def _refuse(why: str) -> int:
@@ -136,10 +131,11 @@ def _refuse(why: str) -> int:
 
 
 def _list(_: List) -> int:
-    width = max(map(len, registry.DESCRIPTIONS))
-    every = {**registry.DESCRIPTIONS, registry.ALL: f"run {', '.join(registry.FIGURES)} (Figures 5 to 9)"}
-    for name, description in every.items():
-        print(f"{name:{width}}  {description}")
+    width = max(map(len, registry.EXPERIMENTS))
+    for name, entry in registry.EXPERIMENTS.items():
+        print(f"{name:{width}}  {entry.description}; presets: {', '.join(entry.presets)}")
+    print(f"{registry.ALL:{width}}  run {', '.join(registry.FIGURES)} (Figures 5 to 9)")
+    print("The first preset of an experiment is its default.")
     return 0
 
 
@@ -149,10 +145,12 @@ def _run(name: str, arguments: list[str]) -> int:
     registry.check_name(name)
     if any(word == "--speed" or word.startswith("--speed=") for word in arguments):
         raise UserError(
-            "--speed is no setting of an experiment; to watch a walk: "
+            "--speed is not a setting of an experiment; to show a walk: "
             "`python -m creps_jax.tools play --speed M/S`"
         )
     early = _early_options(arguments)
+    if early.preset is not None:
+        registry.check_preset(name, early.preset)
     if early.distributed:
         if early.out is None:
             raise UserError("processes that share a run need --out, a folder that all of them see")
@@ -161,15 +159,16 @@ def _run(name: str, arguments: list[str]) -> int:
     from rich.console import Console
 
     from experiments import runner
+    from experiments.request import Request, default_settings, folder_to_resume
 
     experiment = registry.load(name)
-    folder = runner.folder_to_resume(name, early.out, early.robot) if early.resume else early.out
-    default = runner.default_settings(
+    folder = folder_to_resume(name, early.out, early.robot) if early.resume else early.out
+    default = default_settings(
         experiment, name, preset=early.preset, config=early.config, out=folder, resume=early.resume
     )
     options, settings = _options_and_settings(experiment, name, arguments, default)
     check_seed(options.seed)
-    request = runner.Request(
+    request = Request(
         name=name,
         preset=options.preset,
         config=options.config,
@@ -178,14 +177,14 @@ def _run(name: str, arguments: list[str]) -> int:
         out=folder,
         resume=options.resume,
     )
-    # A run that is told to end saves what it has, as one that is interrupted does.
+    # A run that gets SIGTERM saves its state, as after Ctrl-C.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     runner.run(request, console=Console(highlight=False, soft_wrap=True), say=say)
     return 0
 
 
 def _early_options(arguments: list[str]) -> argparse.Namespace:
-    """Read what decides which settings the others change; mistakes are left to the parser of them all."""
+    """Parse the options that decide on the default settings; `parse` reports the mistakes."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     for name in ("config", "out"):
         parser.add_argument(f"--{name}", type=Path)
@@ -213,8 +212,8 @@ def _options_and_settings(
         frozen=True,
     )
     attributes = (Run.__doc__ or "").partition("Attributes:")[2].partition("preset:")[2]
-    both.__doc__ = f"{registry.DESCRIPTIONS[name]}\n\nAttributes:\n        preset:{attributes}"
-    parsed = _parse(both, arguments, prog=f" run {name}")
+    both.__doc__ = f"{registry.EXPERIMENTS[name].description}\n\nAttributes:\n        preset:{attributes}"
+    parsed = parse(both, arguments, prog=f"{PROGRAM} run {name}")
     options = {field: getattr(parsed, field) for field, _, _ in fields}
     return Run(name, **options), parsed.settings
 
@@ -225,11 +224,11 @@ def _run_all(arguments: list[str]) -> int:
         raise UserError("--resume and --config go with one experiment, not with all")
     for name in registry.FIGURES:
         if early.preset is not None:
-            registry.preset_settings(registry.load(name), early.preset)
+            registry.check_preset(name, early.preset)
         if early.out is not None and (early.out / name).exists():
-            raise UserError(f"{early.out / name} is there already, name another folder")
+            raise UserError(f"{early.out / name} exists already, name another folder")
     for name in registry.FIGURES:
-        # The last of two equal options counts.
+        # The last of two equal options is used.
         out = [] if early.out is None else ["--out", str(early.out / name)]
         code = _run(name, [*arguments, *out])
         if code:
@@ -250,15 +249,14 @@ def _check(command: Check) -> int:
     for name in command.names:
         registry.check_name(name)
     import_mjx_quietly()
-    from experiments import runner
+    from experiments import claims
 
-    return 0 if runner.check(command.names, say=say) else 1
-
-
-def _named_by_option(command: Run) -> int:
-    """Answer a `run` whose first word is no name: the name may come last."""
-    del command
-    raise UserError(f"the name of the experiment comes first: run {' | '.join(registry.DESCRIPTIONS)}")
+    return 0 if claims.check(command.names, say=say) else 1
 
 
-_HANDLERS = {List: _list, Run: _named_by_option, Plot: _plot, Check: _check}
+def _name_is_late(_: Run) -> int:
+    """Refuse a `run` whose first word is not the name of the experiment."""
+    raise UserError(f"the name of the experiment comes first: run {' | '.join(registry.EXPERIMENTS)}")
+
+
+_HANDLERS = {List: _list, Run: _name_is_late, Plot: _plot, Check: _check}

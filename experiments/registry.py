@@ -1,4 +1,4 @@
-"""List the experiments by name, and load one when it is asked for."""
+"""List the experiments by name, and import one when a command needs it."""
 
 import importlib
 from collections.abc import Callable, Mapping
@@ -8,18 +8,46 @@ import numpy as np
 
 from creps_jax.errors import UserError, suggest
 
-DESCRIPTIONS = {
-    "walk": "a NAO learns to walk at the speed you ask for (the main job)",
-    "walk_slope": "the same up and down slopes: a context of speed and slope, learned from the shipped walk",
-    "fig05_sinus": "learn the sine of the context, with linear and with RBF features (Fig. 5)",
-    "fig06_reaching": "reach via-points with a planar arm (Fig. 6 and 7)",
-    "fig08_hole": "reach into a hole with a planar arm (Fig. 8 and 9)",
-    "fig11_walk": "ways to learn to walk: features, constraints, fits (Fig. 10, 11a and Table 2)",
-    "walk_inside": "what is planned and what the robot does, in a walk that stays up and in one that falls",
-    "updates": "the paper's fit of the policy against the bounded one, on all tasks but walking",
-}
-"""What each experiment shows; its module has the same name."""
 
+class Entry(NamedTuple):
+    """What `list` shows of an experiment without importing its module.
+
+    Attributes:
+        description: one line.
+        presets: the names of its SETTINGS; the first one is the default.
+    """
+
+    description: str
+    presets: tuple[str, ...]
+
+
+EXPERIMENTS = {
+    "walk": Entry(
+        "a NAO learns to walk at a given speed (the main experiment)", ("quick", "paper", "author", "best")
+    ),
+    "walk_slope": Entry(
+        "the same up and down slopes: the context is speed and slope; starts from the shipped walk",
+        ("quick", "best"),
+    ),
+    "fig05_sinus": Entry(
+        "learn the sine of the context, with linear and with RBF features (Fig. 5)", ("paper", "quick")
+    ),
+    "fig06_reaching": Entry("reach via-points with a planar arm (Fig. 6 and 7)", ("paper", "quick")),
+    "fig08_hole": Entry("reach into a hole with a planar arm (Fig. 8 and 9)", ("paper", "quick")),
+    "fig11_walk": Entry(
+        "compare features, constraints and fits of a walk (Fig. 10, 11a and Table 2)",
+        ("quick", "paper", "best"),
+    ),
+    "walk_inside": Entry("measure plan and motion of a walk that stays up and of one that falls", ("quick",)),
+    "updates": Entry(
+        "compare the paper's fit of the policy with the bounded fit, on all tasks but walking",
+        ("best", "quick"),
+    ),
+}
+"""The experiments by name, which is also the name of the module."""
+
+PAPER_ROBOT = "nao"
+"""The robot of the paper: claims are judged on its walks."""
 
 ALL = "all"
 """Stands for `FIGURES`, one after the other."""
@@ -28,14 +56,14 @@ FIGURES = ("fig05_sinus", "fig06_reaching", "fig08_hole")
 
 
 class Claim(NamedTuple):
-    """Something that a figure or table of the paper says, and what we ask of ours.
+    """A statement of a figure or table of the paper, and the limits within which our value must be.
 
     Attributes:
         metric: what is measured.
-        paper: the paper's value; None where it prints none.
+        paper: the paper's value; None if it prints none.
         measure: from an experiment's arrays to our value.
-        low: the least that ours may be.
-        high: the most that ours may be.
+        low: lower limit.
+        high: upper limit.
     """
 
     metric: str
@@ -46,9 +74,11 @@ class Claim(NamedTuple):
 
 
 class Experiment(Protocol):
-    """What a module of an experiment has; it may also have `finish(settings, arrays, folder, say)`.
+    """What the module of an experiment must have.
 
-    Its settings may have `resolved()`, which returns them with all that defaults or the machine decide.
+    It may also have `table(arrays)`, the columns of table.md, and `finish(settings, arrays, folder, say)`,
+    which writes more files. Its settings may have `resolved()`, which returns them with a value in place of
+    each default that depends on the robot or the machine.
     """
 
     Settings: type[Any]
@@ -70,8 +100,18 @@ def check_name(name: str) -> None:
     Raises:
         UserError: with the nearest name, and all of them.
     """
-    if name not in DESCRIPTIONS:
-        raise UserError(f"unknown experiment {name!r}{suggest(name, DESCRIPTIONS)}")
+    if name not in EXPERIMENTS:
+        raise UserError(f"unknown experiment {name!r}{suggest(name, EXPERIMENTS)}")
+
+
+def check_preset(name: str, preset: str) -> None:
+    """Refuse a preset that an experiment does not have.
+
+    Raises:
+        UserError: with the nearest preset, and all of them.
+    """
+    if preset not in EXPERIMENTS[name].presets:
+        raise UserError(f"unknown preset {preset!r}{suggest(preset, EXPERIMENTS[name].presets)}")
 
 
 def load(name: str) -> Experiment:
@@ -82,14 +122,3 @@ def load(name: str) -> Experiment:
     """
     check_name(name)
     return cast(Experiment, importlib.import_module(f"experiments.{name}"))
-
-
-def preset_settings(experiment: Experiment, preset: str) -> Any:
-    """Return the settings of a preset.
-
-    Raises:
-        UserError: if the experiment has none of that name.
-    """
-    if preset not in experiment.SETTINGS:
-        raise UserError(f"unknown preset {preset!r}{suggest(preset, experiment.SETTINGS)}")
-    return experiment.SETTINGS[preset]

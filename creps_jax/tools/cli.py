@@ -1,6 +1,6 @@
-"""Read the command line, `creps-jax play | export | session`, also `python -m creps_jax.tools`.
+"""The command line `creps-jax play | export | session`, also `python -m creps_jax.tools`.
 
-Nothing heavy is imported before it is clear that it is needed: help and mistakes are answered at once.
+jax and MuJoCo are imported only when a command needs them: help and mistakes are printed at once.
 """
 
 import dataclasses
@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-import tyro
-from tyro.conf import FlagCreatePairsOff, arg, subcommand
+from tyro.conf import arg, subcommand
 
+from creps_jax.tools.arguments import parse
 from creps_jax.tools.command_line import answer, check_seed, say
 from creps_jax.tools.process import import_mjx_quietly
 from creps_jax.tools.session import commands
@@ -19,17 +19,16 @@ from creps_jax.tools.session.commands import SessionCommand
 OVERVIEW = """\
 Use a learned policy.
 
-  creps-jax play --speed 0.3        show a walk at this speed: its parameters and a video
-  creps-jax play                    show walks at six speeds side by side
+  creps-jax play --speed 0.3        show the parameters and a video of a walk at this speed
+  creps-jax play                    show a video of walks at six speeds
   creps-jax export --to walk.h      write a policy (.onnx, .h) or one of its walks (.csv, .npz)
   creps-jax session                 learn on a real robot, trial by trial
 
-Without --policy, play and export take the policy that was learned last, or else the one that comes with the
-package; play prints where it is. A session needs --policy or --define.
-Add --help to any of these for all its options.
+Without --policy, play and export load the latest learned policy, or else the policy of the package; play
+prints its path. A session needs --policy or --define. Add --help to a command to list its options.
 """
 
-# Options that are left out are described in words, not as "None".
+# Defaults that are None are described in the help text.
 _Text = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
 _Number = Annotated[float | None, arg(metavar="M/S", help_behavior_hint="")]
 _Seconds = Annotated[float | None, arg(metavar="S", help_behavior_hint="")]
@@ -39,12 +38,12 @@ _File = Annotated[Path | None, arg(metavar="PATH", help_behavior_hint="")]
 
 @dataclasses.dataclass(frozen=True)
 class Play:
-    """Show walks of a policy: what they reach, and a video with the walks side by side.
+    """Show walks of a policy: reached speeds, and a video with the walks side by side.
 
     Attributes:
-        speed: Speeds in m/s; six over the policy's range by default.
-        policy: Policy file; the latest learned or else the shipped one by default.
-        robot: Whose policy; nao by default, or the one of the file.
+        speed: Speeds in m/s; by default six speeds over the range of the policy.
+        policy: Policy file; by default the latest learned policy, or else the shipped one.
+        robot: Robot of the policy; by default the robot of the file, or nao.
         out: The .mp4 file.
         seed: Seed of the noise; 0 by default.
     """
@@ -58,13 +57,13 @@ class Play:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write a policy, or the joint set-points of one of its walks, for use elsewhere.
+    """Write a policy, or the joint set-points of one of its walks, for other programs.
 
     Attributes:
-        to: The file. The policy becomes an ONNX model (.onnx) or a C header (.h); a walk, played from
-            standstill and without posture feedback, becomes a table (.csv) or arrays (.npz).
-        policy: Policy file; the latest learned or else the shipped one of walking by default.
-        robot: Whose policy; nao by default, or the one of the file.
+        to: The file. A policy is written as an ONNX model (.onnx) or a C header (.h); a walk from standstill,
+            without posture feedback, is written as a table (.csv) or arrays (.npz).
+        policy: Policy file; by default the latest learned walking policy, or else the shipped one.
+        robot: Robot of the policy; by default the robot of the file, or nao.
         speed: Speed of the walk in m/s (.csv and .npz only).
         duration: Length of the walk in s (.csv and .npz only); 8 by default.
     """
@@ -84,12 +83,15 @@ Command = (
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Do what the arguments ask for and return the exit code, see `command_line.answer`."""
+    """Run the command of the arguments and return the exit code, see `command_line.answer`."""
     if not arguments or list(arguments) in (["-h"], ["--help"], ["help"]):
         print(OVERVIEW, end="")
         return 0
-    command = tyro.cli(Command, args=list(arguments), prog="creps-jax", config=(FlagCreatePairsOff,))  # type: ignore[arg-type]
-    return answer(lambda: _HANDLERS[type(command)](command))
+    return answer(lambda: _run(parse(Command, arguments, prog="creps-jax")))
+
+
+def _run(command: Play | Export | SessionCommand) -> int:
+    return _HANDLERS[type(command)](command)
 
 
 def _play(command: Play) -> int:

@@ -1,6 +1,7 @@
-"""What all command lines share: how a process starts, ends, and answers mistakes."""
+"""Start a command line, report mistakes in one line, and end the process with an exit code."""
 
 import contextlib
+import errno
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -12,6 +13,8 @@ from creps_jax.tools.process import keep_interrupts, prepare
 
 INTERRUPTED = 130
 """The exit code of a command that Ctrl-C ended."""
+BROKEN_PIPE = 141
+"""The exit code of a command whose output nobody reads any more."""
 
 
 def say(line: str) -> None:
@@ -19,21 +22,48 @@ def say(line: str) -> None:
     print(line, flush=True)
 
 
-def answer(command: Callable[[], int]) -> int:
-    """Run a command and return its exit code: 2 for a mistake, which is told in one line, 130 for Ctrl-C."""
+def answer(command: Callable[[], int | None]) -> int:
+    """Run a command and return its exit code: 2 after a mistake, which is reported in one line."""
     try:
-        return command()
-    except (UserError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        code = command()
+        sys.stdout.flush()
+        return code or 0
+    except UserError as error:
+        return _refuse(str(error))
+    except BrokenPipeError:
+        # The reader of the pipe has ended: as programs do that the system ends for this, say nothing.
+        _drop_output()
+        return BROKEN_PIPE
+    except OSError as error:
+        return _refuse(_reason(error))
     except ValueError as error:
-        # What the library refuses, such as a setting out of its range, is a mistake; anything else is a bug.
+        # A ValueError of the library, such as a setting out of its range, is a mistake; another one is a bug.
         if not _is_refused_by_the_library(error):
             raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return _refuse(str(error))
     except KeyboardInterrupt:
         return INTERRUPTED
+
+
+def _refuse(message: str) -> int:
+    print(f"error: {message}", file=sys.stderr)
+    return 2
+
+
+def _reason(error: OSError) -> str:
+    """Return a sentence with the file and the reason of an error of the system."""
+    reason = error.strerror or str(error)
+    if error.filename is not None:
+        return f"cannot use {error.filename}: {reason}"
+    if error.errno == errno.ENOSPC:
+        _drop_output()
+        return f"cannot write to the standard output: {reason}"
+    return reason
+
+
+def _drop_output() -> None:
+    """Drop text that is not printed yet: Python would try to print it again at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _is_refused_by_the_library(error: ValueError) -> bool:
@@ -47,7 +77,7 @@ def _is_refused_by_the_library(error: ValueError) -> bool:
 
 
 def check_seed(seed: int | None) -> None:
-    """Refuse a seed that no key can be made from.
+    """Refuse a seed that jax cannot make a key from.
 
     Raises:
         UserError: if it is below zero or too large.
@@ -62,7 +92,7 @@ def start(main: Callable[[Sequence[str]], int]) -> Never:
     keep_interrupts()
     code = main(sys.argv[1:])
     if code == INTERRUPTED:
-        # Devices may still be at work, in Python if C steps the robot: to take Python down under it crashes.
+        # Devices may still run callbacks in Python, if C steps the robot: ending Python normally would crash.
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):  # the reader of a pipe may be gone
                 stream.flush()
