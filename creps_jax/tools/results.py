@@ -1,4 +1,4 @@
-"""Keep results in folders of whole files: arrays, figures, tables and a manifest of how they came about."""
+"""Result folders: arrays, figures, tables, and a manifest with settings, seed and versions."""
 
 import contextlib
 import dataclasses
@@ -6,7 +6,7 @@ import datetime
 import importlib.metadata
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ _PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "scipy", "matplot
 
 
 def new_folder(parent: Path, name: str) -> Path:
-    """Make a new folder `parent/name`, or `name-2`, `name-3`, ... where that is taken.
+    """Make a new folder `parent/name`, or `name-2`, `name-3`, ... if it exists already.
 
     Raises:
         UserError: if the folder cannot be made.
@@ -41,14 +41,14 @@ def new_folder(parent: Path, name: str) -> Path:
 
 
 def stamp() -> str:
-    """Return the local time as a folder name, sorted as time goes."""
+    """Return the local time as a folder name; names sort by time."""
     return datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
 
 
 def latest_folder(
     experiment: str, *, status: str | None = None, robot: str | None = None, root: Path | None = None
 ) -> Path | None:
-    """Find the newest result folder of an experiment, with a given status and robot if one is asked for."""
+    """Return the newest result folder of an experiment, with this status and robot if they are given."""
     parent = (root or default_root()) / experiment
     found = []
     for path in parent.glob(f"*/{MANIFEST}"):
@@ -60,18 +60,18 @@ def latest_folder(
 
 
 def robot_of(manifest: Mapping[str, Any]) -> str:
-    """Return whose results a manifest tells of; those of experiments without a robot are the NAO's too."""
+    """Return the robot of a result: the NAO if the settings have none."""
     settings = manifest.get("settings")
     return str(settings.get("robot", "nao")) if isinstance(settings, Mapping) else "nao"
 
 
 def default_root() -> Path:
-    """Return where result folders go unless told otherwise: `results/` in the working folder."""
+    """Return the default folder of result folders: `results/` in the working folder."""
     return Path("results")
 
 
 def make_manifest(experiment: str, preset: str, settings: Any, seed: int) -> dict[str, Any]:
-    """Say how results come about: settings, seed, commit, versions and processor."""
+    """Return the manifest of a run: settings, seed, commit, versions and processor."""
     return {
         "experiment": experiment,
         "preset": preset,
@@ -94,7 +94,7 @@ def load_manifest(folder: Path) -> dict[str, Any]:
     """Read the manifest of a result folder.
 
     Raises:
-        UserError: if there is none, or it is no manifest.
+        UserError: if there is no manifest, or it is invalid.
     """
     if not (folder / MANIFEST).exists():
         raise UserError(f"{folder} is no result folder: it has no {MANIFEST}")
@@ -105,7 +105,7 @@ def load_manifest_file(path: Path) -> dict[str, Any]:
     """Read a manifest.
 
     Raises:
-        UserError: if there is no such file, or it is no manifest.
+        UserError: if the file does not exist, or is not a manifest.
     """
     manifest = files.load_json(path)
     if not isinstance(manifest, dict) or not isinstance(manifest.get("settings"), dict):
@@ -114,7 +114,7 @@ def load_manifest_file(path: Path) -> dict[str, Any]:
 
 
 def git_commit() -> str | None:
-    """Return the commit of the checkout, marked where files differ from it; None without a checkout."""
+    """Return the commit of the checkout, marked "-dirty" if files differ; None without a checkout."""
     if not (_CHECKOUT / "pyproject.toml").is_file():
         return None
     try:
@@ -128,7 +128,7 @@ def git_commit() -> str | None:
 
 
 def package_versions() -> dict[str, str]:
-    """Return the versions of the packages that decide the numbers."""
+    """Return the versions of the packages that affect the numbers."""
     versions = {}
     for name in _PACKAGES:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -137,9 +137,22 @@ def package_versions() -> dict[str, str]:
 
 
 def processor_name() -> str:
-    """Return the processor's name as the system tells it."""
+    """Return the name of the processor."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()
+
+
+@contextlib.contextmanager
+def complete(folder: Path) -> Iterator[None]:
+    """Report an array that a result lacks, for example because another version wrote it.
+
+    Raises:
+        UserError: in place of a KeyError, with the file.
+    """
+    try:
+        yield
+    except KeyError as error:
+        raise UserError(f"{folder / ARRAYS} lacks {error}: it is of another version or experiment") from error

@@ -10,7 +10,8 @@ import pytest
 
 from creps_jax.search.archive import push
 from creps_jax.search.creps import CrepsState, creps
-from experiments import comparison, registry, walk
+from experiments import comparison, registry
+from experiments.walking import learning as walk_learning
 from tests.experiments import tiny as small
 
 
@@ -30,7 +31,7 @@ def simple_updates(monkeypatch):
 
         return dataclasses.replace(algorithm, tell=tell)
 
-    for module in (comparison, walk):
+    for module in (comparison, walk_learning):
         monkeypatch.setattr(module, "creps", make)
 
 
@@ -41,6 +42,6 @@ def tiny(tmp_path, monkeypatch):
     module = types.ModuleType("experiments.tiny")
     vars(module).update({name: value for name, value in vars(small).items() if not name.startswith("__")})
     monkeypatch.setitem(sys.modules, "experiments.tiny", module)
-    monkeypatch.setitem(registry.DESCRIPTIONS, "tiny", "a small experiment")
+    monkeypatch.setitem(registry.EXPERIMENTS, "tiny", small.ENTRY)
     monkeypatch.chdir(tmp_path)
     return module

@@ -7,15 +7,16 @@ import pytest
 
 from creps_jax import files
 from creps_jax.errors import UserError
+from creps_jax.policies.feature_settings import Features
 from creps_jax.tools import folder_lock, results
-from experiments import learning, registry, runner
+from experiments import claims, learning, registry, runner, walk
 from experiments.cli import main
-from experiments.runner import Request
+from experiments.request import Request, default_settings, folder_to_resume
 
 
 def run(said=None, changes=None, **request):
     begin = {name: value for name, value in request.items() if name != "seed"}
-    settings = runner.default_settings(registry.load("tiny"), "tiny", **begin)
+    settings = default_settings(registry.load("tiny"), "tiny", **begin)
     settings = dataclasses.replace(settings, **(changes or {}))
     said = [] if said is None else said
     return runner.run(Request("tiny", settings, **request), console=None, say=said.append)
@@ -73,7 +74,7 @@ def test_settings_that_are_refused_leave_no_run_behind(tiny, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         interrupt_after(patch, 2, KeyboardInterrupt())
         run()
-    unfinished = runner.folder_to_resume("tiny", None)
+    unfinished = folder_to_resume("tiny", None)
 
     def refuse(settings, key, session):
         raise ValueError("kl_bound must be above 0")
@@ -82,7 +83,7 @@ def test_settings_that_are_refused_leave_no_run_behind(tiny, monkeypatch):
     for out in (None, Path("named")):
         with pytest.raises(ValueError, match="kl_bound"):
             run(out=out)
-    assert runner.folder_to_resume("tiny", None) == unfinished
+    assert folder_to_resume("tiny", None) == unfinished
     assert not Path("named").exists()
 
 
@@ -179,6 +180,68 @@ def test_a_manifest_that_no_run_has_written_is_refused(tiny, changes, match):
     assert not Path("new").exists()
 
 
+@pytest.mark.parametrize(
+    ("out", "reason"),
+    [
+        ("/proc/foo", "cannot write to the folder /proc/foo: No such file or directory"),
+        ("/proc", "/proc holds other files, such as"),
+        ("file/below", "cannot write to the folder file/below: Not a directory"),
+        ("file", "file is a file, expected a folder"),
+        ("/dev/full", "/dev/full is a file, expected a folder"),
+        ("long" * 100, "File name too long"),
+    ],
+)
+def test_a_bad_place_for_results_is_one_sentence(tiny, capsys, out, reason):
+    Path("file").write_text("")
+    assert main(["run", "tiny", "--out", out]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and reason in error and out in error and len(error.splitlines()) == 1
+    assert "Errno" not in error
+
+
+def test_a_place_that_becomes_bad_is_one_sentence(tiny, capsys, monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied", "here")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    assert main(["run", "tiny", "--out", "here"]) == 2
+    assert capsys.readouterr().err == "error: cannot use here: Permission denied\n"
+
+
+def test_changed_settings_are_named_beside_the_claims(tiny, capsys):
+    folder = run(out=Path("results/tiny/one"))
+    assert main(["check", "tiny"]) == 0
+    assert "\nsettings: preset quick\n" in capsys.readouterr().out
+    run(out=Path("results/tiny/two"), changes={"iterations": 2, "speeds": (0.3,)})
+    assert main(["check", "tiny"]) == 0
+    note = (
+        "settings: preset quick, but iterations 2 (preset: 4), speeds (0.3,) (preset: (0.1, 0.2)); "
+        "the claims are judged all the same"
+    )
+    assert note in capsys.readouterr().out.splitlines()
+    assert note in Path("results/tiny/two/claims.md").read_text()
+    run(out=Path("results/tiny/three"), config=folder / "manifest.json")
+    assert main(["check", "tiny"]) == 0
+    assert "settings: not from a preset, but from config; the claims" in capsys.readouterr().out
+    manifest = results.load_manifest(folder)
+    assert "of another version" in claims.settings_note(tiny, {**manifest, "settings": {"foo": 1}})
+
+
+def test_settings_that_the_machine_decides_do_not_differ_from_a_preset():
+    for physics in ("c", "mjx"):
+        settings = dataclasses.replace(walk.SETTINGS["best"].resolved(), physics=physics)
+        manifest = results.make_manifest("walk", "best", settings, 0)
+        assert claims.settings_note(registry.load("walk"), manifest) == "settings: preset best"
+    settings = dataclasses.replace(settings, features=Features("rbf", 7), high=0.5)
+    note = claims.settings_note(registry.load("walk"), results.make_manifest("walk", "best", settings, 0))
+    assert "preset best, but features.num_centers 7 (preset: 5), high 0.5 (preset: 0.6); the" in note
+
+
+@pytest.mark.parametrize("name", registry.EXPERIMENTS)
+def test_presets_are_listed_as_the_modules_have_them(name):
+    assert registry.EXPERIMENTS[name].presets == tuple(registry.load(name).SETTINGS)
+
+
 def test_plot_and_check_use_the_latest_results(tiny, capsys):
     assert main(["plot", "tiny"]) == 2
     folder = run(changes={"iterations": 1})
@@ -212,10 +275,8 @@ def test_every_setting_is_an_option_and_a_manifest_runs_a_run_again(tiny, capsys
     one, other = (files.load_arrays(Path(name) / "arrays.npz") for name in ("first", "again"))
     np.testing.assert_array_equal(one["reward"], other["reward"])
     capsys.readouterr()
-    with pytest.raises(SystemExit) as stop:
-        main(["run", "tiny", "--trails", "1"])
-    assert stop.value.code == 2
-    assert "--trials" in capsys.readouterr().err
+    assert main(["run", "tiny", "--trails", "1"]) == 2
+    assert "unknown option --trails, did you mean --trials?" in capsys.readouterr().err
 
 
 def test_all_runs_every_figure_in_a_folder_of_its_own(tiny, monkeypatch):

@@ -33,6 +33,7 @@ class Settings:
 
 
 SETTINGS = {"quick": Settings(), "long": Settings(iterations=6)}
+ENTRY = registry.Entry("a small experiment", tuple(SETTINGS))
 CLAIMS = (Claim("last reward", -1.0, lambda arrays: arrays["reward"][:, -1].mean(), low=-10.0),)
 
 
@@ -54,6 +55,6 @@ if __name__ == "__main__":
     from experiments.cli import main
 
     sys.modules["experiments.tiny"] = sys.modules["__main__"]
-    registry.DESCRIPTIONS["tiny"] = "a small experiment"
+    registry.EXPERIMENTS["tiny"] = ENTRY
     learning._SECONDS_BETWEEN_CHECKPOINTS = 0.0
     sys.exit(main(sys.argv[1:]))
