@@ -1,4 +1,4 @@
-"""Compare ways to learn: trials of each, judged by their mean policies on one grid of contexts."""
+"""Compare learners: train several trials of each, evaluate their mean policies on one grid of contexts."""
 
 import dataclasses
 import math
@@ -16,19 +16,20 @@ from creps_jax.search.creps import Creps, creps
 from creps_jax.search.fit import fit_within
 from creps_jax.search.importance import Importance
 from creps_jax.tasks.base import Task
-from creps_jax.tools import plots
 from creps_jax.training import evaluate
+from experiments import records
 from experiments.learning import Plan, Session, learn, trial_keys
+from experiments.records import Arrays, Part
 
 NUM_EVALUATED = 40
 
 
 class Contender(NamedTuple):
-    """One way to learn a task.
+    """A learner and its task.
 
     Attributes:
-        task: the task; contenders may differ in how its contexts are drawn.
-        algorithm: what learns it.
+        task: the task; contenders may draw its contexts from different distributions.
+        algorithm: the search.
         start: the first policy of every trial.
     """
 
@@ -39,7 +40,7 @@ class Contender(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class LearnerSettings:
-    """Settings that all comparisons have; the paper gives samples, archive and KL bound.
+    """Settings of all comparisons; the paper gives samples, archive and KL bound.
 
     Attributes:
         iterations: iterations of learning.
@@ -53,10 +54,10 @@ class LearnerSettings:
             is the paper's unbounded fit.
         cov_kl_bound: the same for the covariance, nats.
         start_std: standard deviation of the first policy, whose mean is zero.
-        significance: p-value from which on the covariance stays, see `creps_jax.creps`; None is the paper's
-            update, which moves it whatever the evidence.
-        importance_policies: number of last policies whose samples are weighed by importance, see
-            `creps_jax.Importance`; None is the paper's archive, all of whose samples count equally.
+        significance: p-value above which the covariance is not updated, see `creps_jax.creps`; None is the
+            paper's update, which has no such test.
+        importance_policies: number of last policies whose samples get importance weights, see
+            `creps_jax.Importance`; None is the paper's archive, in which all samples have the same weight.
     """
 
     iterations: int = 1000
@@ -76,7 +77,7 @@ class LearnerSettings:
 def make_contender(
     task: Task, features: tuple[FeatureMap, FeatureMap], settings: LearnerSettings
 ) -> Contender:
-    """Put a contender together from policy and baseline features and an experiment's settings."""
+    """Make a contender from policy and baseline features and the settings of an experiment."""
     algorithm = creps(
         *features,
         kl_bound=settings.kl_bound,
@@ -98,22 +99,22 @@ def compare(
     grid: jax.Array,
     session: Session = Session(),
 ) -> dict[str, np.ndarray]:
-    """Let each contender learn, all its trials at once, and judge its mean policies on a grid of contexts.
+    """Train each contender, all its trials at once, and evaluate its mean policies on a grid of contexts.
 
     Args:
         contenders: by name; all begin with the same keys.
         settings: iterations, trials and samples.
         key: random key.
-        grid: (n, s) contexts to judge on.
+        grid: (n, s) contexts of the evaluation.
         session: where to keep checkpoints and show progress.
 
     Returns:
         `context`, the grid; `episodes` (iterations,) and `evaluated`, the iterations (from 1) after which
-        mean policies were judged; and for each NAME: `NAME.sample_reward` and `plots.TRACES` of the
-        updates (trials, iterations), `NAME.grid_reward` (trials, evaluated, n), `NAME.coef` (trials, p, d),
-        the last policies'.
+        mean policies were evaluated; and a part for each contender (see `records.Part`): `sample_reward` and
+        the fields of `plots.TRACES` (trials, iterations), `grid_reward` (trials, evaluated, n), and `coef`
+        (trials, p, d) of the last policies.
     """
-    # Rollouts as short as these are not worth sharing out, trials are.
+    # Rollouts are too short to share between devices: share the trials.
     devices = jax.local_devices()
     devices = devices[: max(num for num in range(1, len(devices) + 1) if settings.trials % num == 0)]
     plan = Plan(settings.iterations, settings.samples, settings.first_samples)
@@ -126,28 +127,27 @@ def compare(
     }
     keys = trial_keys(learn_key, settings.trials)
     for contender in contenders.values():
-        contender.algorithm.init(
-            contender.start
-        )  # Refuses settings before hours are spent on another contender.
+        # Refuses settings before hours are spent on another contender.
+        contender.algorithm.init(contender.start)
     for name, contender in contenders.items():
         _, log = learn(keys, *contender, plan, session=session, name=name, devices=devices)
         # A resumed run may have gone on for longer than is asked of it now.
         coef = log["coef"][:, evaluated - 1]
-        arrays[f"{name}.sample_reward"] = log["mean_reward"][:, : plan.iterations]
-        for field in plots.TRACES:
-            arrays[f"{name}.{field}"] = log[f"info.{field}"][:, : plan.iterations]
-        arrays[f"{name}.grid_reward"] = _grid_reward(evaluate_key, contender, coef, grid)
-        arrays[f"{name}.coef"] = coef[:, -1]
+        curves = {"sample_reward": log["mean_reward"], **records.traces(Part(log, "info"))}
+        found = {field: values[:, : plan.iterations] for field, values in curves.items()}
+        found["grid_reward"] = _grid_reward(evaluate_key, contender, coef, grid)
+        arrays |= records.named(name, {**found, "coef": coef[:, -1]})
     return arrays
 
 
-def mean_policy_curve(arrays: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+def mean_policy_curve(arrays: Arrays, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return episodes, and the mean reward over the grid of each trial's mean policy (trials, evaluated)."""
-    return arrays["episodes"][arrays["evaluated"] - 1], arrays[f"{name}.grid_reward"].mean(axis=2)
+    grid_reward = Part(arrays, name)["grid_reward"]
+    return arrays["episodes"][arrays["evaluated"] - 1], grid_reward.mean(axis=2)
 
 
 def learning_panels(
-    arrays: Mapping[str, np.ndarray], panels: Mapping[str, Iterable[str]], labels: Mapping[str, str]
+    arrays: Arrays, panels: Mapping[str, Iterable[str]], labels: Mapping[str, str]
 ) -> dict[str, dict[str, tuple[np.ndarray, np.ndarray]]]:
     """Return what `plots.learning_curves` draws: by title, the labelled curves of some contenders."""
     return {
@@ -156,36 +156,36 @@ def learning_panels(
     }
 
 
-def last_regrets(arrays: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> dict[str, np.ndarray]:
+def last_regrets(arrays: Arrays, labels: Mapping[str, str]) -> dict[str, np.ndarray]:
     """Return what `plots.final_values` draws: the labelled regrets (trials,) of all contenders."""
     return {label: regret(arrays, name) for name, label in labels.items()}
 
 
-def regret(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
-    """Return what each trial's last mean policy (trials,) lacks, on average, to the best that is known.
+def regret(arrays: Arrays, name: str) -> np.ndarray:
+    """Return the regret of each trial's last mean policy (trials,), the mean over the grid.
 
-    The best known at a context is the best reward of any mean policy of any contender.
+    The regret at a context is the difference to the best reward of any mean policy of any contender.
     """
-    rewards = [values for key, values in arrays.items() if key.endswith(".grid_reward")]
-    best = np.max([values.max(axis=(0, 1)) for values in rewards], axis=0)
-    return (best - arrays[f"{name}.grid_reward"][:, -1]).mean(axis=1)
+    rewards = {each: Part(arrays, each)["grid_reward"] for each in records.parts_with(arrays, "grid_reward")}
+    best = np.max([values.max(axis=(0, 1)) for values in rewards.values()], axis=0)
+    return (best - rewards[name][:, -1]).mean(axis=1)
 
 
-def p_value(arrays: Mapping[str, np.ndarray], better: str, worse: str) -> float:
-    """Return how likely regrets so much in favour of `better` are if it is no better.
+def p_value(arrays: Arrays, better: str, worse: str) -> float:
+    """Return the p-value of Wilcoxon's signed-rank test that the regrets of `better` are lower.
 
-    This is Wilcoxon's signed-rank test: trials of one number share their key, and so make pairs.
+    Trials with the same index have the same key, and are pairs.
     """
     return signed_rank_p(regret(arrays, worse) - regret(arrays, better))
 
 
 def signed_rank_p(gains: np.ndarray) -> float:
-    """Return how likely gains (pairs,) so much above zero are if there are none, by Wilcoxon's test."""
+    """Return the p-value of Wilcoxon's signed-rank test that gains (pairs,) are above zero."""
     return float(stats.wilcoxon(gains, alternative="greater").pvalue) if gains.any() else 1.0
 
 
 def median_and_interval(rewards: np.ndarray) -> str:
-    """Return the median and, of six trials or more, its interval of 95 % confidence, by order statistics."""
+    """Return the median and, for six trials or more, its 95 % confidence interval, by order statistics."""
     median = f"{np.median(rewards):.3g}"
     low, high = stats.quantile_test(rewards, p=0.5).confidence_interval(0.95)
     return median if math.isnan(low) else f"{median} ({low:.3g} to {high:.3g})"
@@ -194,23 +194,23 @@ def median_and_interval(rewards: np.ndarray) -> str:
 def share_of_episodes(
     episodes: np.ndarray, curve: np.ndarray, reference: np.ndarray, *, total: float | None = None
 ) -> float:
-    """Return in which share of the episodes a curve gets as far as another does in all of them.
+    """Return the share of the episodes of a reference after which a curve reaches its last reward.
 
-    Both by the median of the trials; infinite if it never does.
+    Both are medians of the trials; infinite if the curve never reaches it.
 
     Args:
         episodes: (k,) rollouts so far.
         curve: (trials, k) rewards.
-        reference: (trials, j) rewards of the other.
-        total: rollouts of the other after all, if not `episodes[-1]`.
+        reference: (trials, j) rewards of the reference.
+        total: rollouts of the reference, if not `episodes[-1]`.
     """
-    is_there = np.median(curve, axis=0) >= np.median(reference[:, -1])
+    has_reached = np.median(curve, axis=0) >= np.median(reference[:, -1])
     total = episodes[-1] if total is None else total
-    return float(episodes[is_there][0] / total) if is_there.any() else math.inf
+    return float(episodes[has_reached][0] / total) if has_reached.any() else math.inf
 
 
 def mean_thetas(contender: Contender, coef: np.ndarray | jax.Array, contexts: jax.Array) -> jax.Array:
-    """Return what a mean policy (p, d) gives at contexts (n, s), as (n, d)."""
+    """Return the parameters (n, d) of a mean policy (p, d) at contexts (n, s)."""
     policy = LinearGaussian(jnp.asarray(coef), contender.start.cov_chol)
     return contender.algorithm.mean(policy, contexts)
 
@@ -218,7 +218,7 @@ def mean_thetas(contender: Contender, coef: np.ndarray | jax.Array, contexts: ja
 def postures(
     contender: Contender, coef: np.ndarray, contexts: jax.Array, points: Callable[[jax.Array], jax.Array]
 ) -> np.ndarray:
-    """Return the postures of an arm under a mean policy: what `points` makes of each context's theta."""
+    """Return the postures of an arm under a mean policy: `points` of the parameters at each context."""
     return np.asarray(jax.vmap(points)(mean_thetas(contender, coef, contexts)))
 
 

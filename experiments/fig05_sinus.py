@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 import jax
 import numpy as np
@@ -22,6 +21,7 @@ from experiments.comparison import (
     p_value,
 )
 from experiments.learning import Session
+from experiments.records import Arrays, Part, named
 from experiments.registry import Claim
 
 LOW, HIGH = 0.0, 5 * math.pi
@@ -32,11 +32,11 @@ LABELS = {"linear": "Linear features", "rbf": "RBF features"}
 class Settings(LearnerSettings):
     """Settings of the experiment.
 
-    Few contexts are drawn near the ends of the range. Without a larger ridge some trials end with wild
+    Few contexts are drawn near the ends of the range. Without a larger ridge some trials end with very large
     coefficients there.
 
     Attributes:
-        num_centers: K; two centres a half-wave and one are enough to follow the sine.
+        num_centers: K; two centres for each half-wave and one more are enough to follow the sine.
     """
 
     iterations: int = 150
@@ -51,7 +51,8 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     """Learn with both kinds of features.
 
     Returns:
-        The arrays of `compare`, with the contenders linear and rbf, and their last policies over the grid.
+        The arrays of `compare`, with the contenders linear and rbf, and the `mean` (trials, n) of their last
+        policies over the grid.
     """
     rbf = rbf_features(LOW, HIGH, settings.num_centers)
     features = {"linear": (linear_features(1), quadratic_features(1)), "rbf": (rbf, rbf)}
@@ -60,12 +61,12 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     grid = context_grid(LOW, HIGH, 201)
     arrays = compare(contenders, settings, key, grid=grid, session=session)
     for name, contender in contenders.items():
-        means = [mean_thetas(contender, coef, grid)[:, 0] for coef in arrays[f"{name}.coef"]]
-        arrays[f"{name}.mean"] = np.stack(means)
+        means = [mean_thetas(contender, coef, grid)[:, 0] for coef in Part(arrays, name)["coef"]]
+        arrays |= named(name, {"mean": np.stack(means)})
     return arrays
 
 
-def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+def plot(arrays: Arrays) -> dict[str, Figure]:
     """Draw the learning curves and the learned policies."""
     policies, axes = plots.new_figure(1, 2, width=9.0, height=3.4, sharey=True)
     context = arrays["context"][:, 0]
@@ -73,7 +74,7 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
         plots.plot_policy(
             axes[0, column],
             context,
-            arrays[f"{name}.mean"],
+            Part(arrays, name)["mean"],
             np.sin(context),
             title=label,
             labels=("context s (rad)", "parameter"),
@@ -87,7 +88,7 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
 
 CLAIMS = (
     Claim(
-        "RBFs learn it better than linear features: p of Wilcoxon's test",
+        "RBFs learn better than linear features: p of Wilcoxon's test",
         None,
         lambda arrays: p_value(arrays, "rbf", "linear"),
         high=0.05,

@@ -1,7 +1,6 @@
 """Reach via-points with a planar arm (Abdolmaleki et al. 2016, 4.2, Fig. 6 and 7)."""
 
 import dataclasses
-from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +21,7 @@ from experiments.comparison import (
     postures,
 )
 from experiments.learning import Session
+from experiments.records import Arrays, Part, named
 from experiments.registry import Claim
 
 LOW, HIGH = (-1.5, -1.5), (-0.5, -0.5)
@@ -49,15 +49,15 @@ class Settings(LearnerSettings):
     bandwidth: float = 0.5**0.5
 
 
-# RBFs are behind for half of the iterations: with fewer of them, or fewer trials, its claims cannot be held.
+# RBFs need half of the iterations to catch up: with fewer iterations or trials the claims do not hold.
 SETTINGS = {"paper": Settings(), "quick": Settings(trials=10)}
 
 
 def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
     """Learn with linear and RBF features, with quadratic ones, and with uniform contexts.
 
-    The paper has no quadratic policies. Theirs are the linear features and the squares of the contexts: they
-    can do all that linear ones can, and show how much there is to gain.
+    The paper has no quadratic policies. Their features are the linear features and the squares of the
+    contexts: they contain the linear policies, and show how much a better policy can gain.
 
     Returns:
         The arrays of `compare`, with the contenders linear, rbf, quadratic and uniform.
@@ -78,12 +78,13 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     grid = context_grid(LOW, HIGH, 6)
     arrays = compare(contenders, settings, key, grid=grid, session=session)
     for name in ("linear", "rbf"):
-        arrays[f"{name}.postures"] = postures(
+        shown = postures(
             contenders[name],
-            arrays[f"{name}.coef"][0],
+            Part(arrays, name)["coef"][0],
             jnp.array(SHOWN),
             lambda theta: jax.vmap(arm_points)(via_point_movement(theta).pos),
         )
+        arrays |= named(name, {"postures": shown})
     return arrays
 
 
@@ -98,7 +99,7 @@ def _linear_and_squares() -> FeatureMap:
     return FeatureMap(apply, 5, 2)
 
 
-def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+def plot(arrays: Arrays) -> dict[str, Figure]:
     """Draw Fig. 6a and 6b, the last regrets, and the arm's postures (Fig. 7)."""
     panels = {
         "Policies": ("linear", "rbf", "quadratic"),
@@ -107,7 +108,7 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     figure, axes = plots.new_figure(2, len(SHOWN), width=8.0, height=7.4)
     for row, name in enumerate(("linear", "rbf")):
         for column, point in enumerate(SHOWN):
-            plots.plot_postures(axes[row, column], arrays[f"{name}.postures"][column])
+            plots.plot_postures(axes[row, column], Part(arrays, name)["postures"][column])
             axes[row, column].plot(*point, "x", color=plots.FALL_COLOUR, markersize=10, markeredgewidth=2)
             axes[row, column].set_title(f"{LABELS[name]}: via-point ({point[0]:g}, {point[1]:g})")
     return {

@@ -1,9 +1,7 @@
 """Reach into a hole with a planar arm (Abdolmaleki et al. 2016, 4.2, Fig. 8 and 9)."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +13,6 @@ from creps_jax.errors import UserError
 from creps_jax.policies.features import linear_features, quadratic_features, rbf_features
 from creps_jax.tasks.planar_arm import arm_points, hole_movement, hole_reaching
 from creps_jax.tools import plots
-from creps_jax.tools.tables import save_table
 from experiments.comparison import (
     Contender,
     LearnerSettings,
@@ -28,12 +25,13 @@ from experiments.comparison import (
     postures,
 )
 from experiments.learning import Session
+from experiments.records import Arrays, Part, named, parts_with
 from experiments.registry import Claim
 
 LOW, HIGH = 1.4, 2.0
 WIDTH, DEPTH = 0.3, 1.0
 SHOWN = (1.5, 2.0)
-# The paper's choice, and what it is held against.
+# The paper's choice.
 SHOWN_RBF = "rbf6"
 
 
@@ -54,7 +52,7 @@ class Settings(LearnerSettings):
             raise UserError(f"num_centers must have 6, the paper's, among them, got {self.num_centers}")
 
 
-# With fewer trials or episodes chance decides between 6 RBFs and a linear policy.
+# With fewer trials or episodes 6 RBFs are not significantly better than a linear policy.
 SETTINGS = {"paper": Settings(), "quick": Settings(trials=10, num_centers=(6,))}
 
 
@@ -73,19 +71,20 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     grid = context_grid(LOW, HIGH, 25)
     arrays = compare(contenders, settings, key, grid=grid, session=session)
     for name, contender in contenders.items():
-        collides = map(partial(_collides, contender, grid), arrays[f"{name}.coef"])
-        arrays[f"{name}.collides"] = np.stack(list(collides))
+        collides = map(partial(_collides, contender, grid), Part(arrays, name)["coef"])
+        arrays |= named(name, {"collides": np.stack(list(collides))})
     for name in ("linear", SHOWN_RBF):
-        arrays[f"{name}.postures"] = postures(
+        shown = postures(
             contenders[name],
-            arrays[f"{name}.coef"][0],
+            Part(arrays, name)["coef"][0],
             jnp.array(SHOWN)[:, None],
             lambda theta: jax.vmap(arm_points)(hole_movement(theta).pos),
         )
+        arrays |= named(name, {"postures": shown})
     return arrays
 
 
-def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+def plot(arrays: Arrays) -> dict[str, Figure]:
     """Draw Fig. 8a and 8b, the last regrets, and the arm's postures (Fig. 9)."""
     labels = {
         name: "linear" if name == "linear" else f"{name.removeprefix('rbf')} RBFs" for name in _names(arrays)
@@ -96,11 +95,12 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     }
     figure, axes = plots.new_figure(2, len(SHOWN), width=8.0, height=8.0)
     for row, name in enumerate(("linear", SHOWN_RBF)):
+        part = Part(arrays, name)
         for column, center in enumerate(SHOWN):
-            plots.plot_postures(axes[row, column], arrays[f"{name}.postures"][column])
+            plots.plot_postures(axes[row, column], part["postures"][column])
             plots.plot_ground(axes[row, column], center, WIDTH, DEPTH)
             nearest = np.abs(arrays["context"][:, 0] - center).argmin()
-            reward = arrays[f"{name}.grid_reward"][0, -1, nearest]
+            reward = part["grid_reward"][0, -1, nearest]
             axes[row, column].set_title(f"{labels[name]}: hole at {center:g} m, reward {reward:,.0f}")
     return {
         "learning_curve": plots.learning_curves(learning_panels(arrays, panels, labels)),
@@ -109,8 +109,8 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     }
 
 
-def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
-    """Return shares of trials and holes that collide, of all and of the ends, and the reward elsewhere."""
+def table(arrays: Arrays) -> dict[str, list[str]]:
+    """Return the share of trials and holes with a collision, all and at the ends, and the other rewards."""
     columns: dict[str, list[str]] = {
         "policy": _names(arrays),
         "collides": [],
@@ -118,35 +118,29 @@ def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
         "else": [],
     }
     for name in _names(arrays):
-        collides, reward = arrays[f"{name}.collides"], arrays[f"{name}.grid_reward"][:, -1]
+        collides, reward = Part(arrays, name)["collides"], Part(arrays, name)["grid_reward"][:, -1]
         columns["collides"].append(f"{collides.mean():.0%}")
         columns["at the ends"].append(f"{_collides_at_the_ends(arrays, name):.0%}")
         columns["else"].append("" if collides.all() else f"{np.median(reward[~collides]):,.0f}")
     return columns
 
 
-def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
-    """Write and say the table."""
-    del settings
-    save_table(table(arrays), folder, say)
+def _names(arrays: Arrays) -> list[str]:
+    return parts_with(arrays, "coef")
 
 
-def _names(arrays: Mapping[str, np.ndarray]) -> list[str]:
-    return [key.removesuffix(".coef") for key in arrays if key.endswith(".coef")]
-
-
-def _num_better(arrays: Mapping[str, np.ndarray]) -> float:
-    """Return how many numbers of RBFs do better than the paper's, at the 5 % level; NaN without others."""
+def _num_better(arrays: Arrays) -> float:
+    """Count the numbers of RBFs that are better than the paper's at the 5 % level; NaN without others."""
     others = [name for name in _names(arrays) if name not in ("linear", SHOWN_RBF)]
     return float(sum(p_value(arrays, name, SHOWN_RBF) < 0.05 for name in others)) if others else np.nan
 
 
-def _collides_at_the_ends(arrays: Mapping[str, np.ndarray], name: str) -> float:
-    return float(arrays[f"{name}.collides"][:, [0, 1, 2, -3, -2, -1]].mean())
+def _collides_at_the_ends(arrays: Arrays, name: str) -> float:
+    return float(Part(arrays, name)["collides"][:, [0, 1, 2, -3, -2, -1]].mean())
 
 
-def _p_of_the_worst(arrays: Mapping[str, np.ndarray]) -> float:
-    """Return the largest p-value of 4, 6 and 10 RBFs being better than 20; NaN where not all have learned."""
+def _p_of_the_worst(arrays: Arrays) -> float:
+    """Return the largest p-value of 4, 6 and 10 RBFs being better than 20; NaN if one of them is missing."""
     names = ("rbf4", SHOWN_RBF, "rbf10", "rbf20")
     if not set(names) <= set(_names(arrays)):
         return np.nan
@@ -154,7 +148,7 @@ def _p_of_the_worst(arrays: Mapping[str, np.ndarray]) -> float:
 
 
 def _collides(contender: Contender, grid: jax.Array, coef: np.ndarray) -> np.ndarray:
-    """Return at which contexts (n,) the movement of a mean policy is in the ground at some time."""
+    """Return whether the movement of a mean policy collides with the ground, for contexts (n,)."""
     outcome = jax.vmap(contender.task.rollout, (None, 0, 0))(
         jax.random.key(0), grid, mean_thetas(contender, coef, grid)
     )
@@ -171,7 +165,7 @@ CLAIMS = (
     Claim(
         "6 RBFs: share of trials and holes with a collision",
         0.0,
-        lambda arrays: float(arrays[f"{SHOWN_RBF}.collides"].mean()),
+        lambda arrays: float(Part(arrays, SHOWN_RBF)["collides"].mean()),
         high=0.05,
     ),
     Claim(
@@ -180,7 +174,7 @@ CLAIMS = (
         lambda arrays: _collides_at_the_ends(arrays, "linear"),
         low=0.05,
     ),
-    Claim("numbers of RBFs that do better than 6, at the 5 % level", 0.0, _num_better, high=0.0),
+    Claim("numbers of RBFs that are better than 6, at the 5 % level", 0.0, _num_better, high=0.0),
     Claim(
         "20 RBFs are worse than 4, 6 and 10: the largest p of the same test", None, _p_of_the_worst, high=0.05
     ),

@@ -1,8 +1,6 @@
-"""Compare ways to learn to walk (Abdolmaleki et al. 2016, 4.3, Fig. 10, 11a and Table 2)."""
+"""Compare features, constraints and fits of a walk (Abdolmaleki et al. 2016, 4.3, Fig. 10, 11a, Table 2)."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,15 +9,19 @@ from matplotlib.figure import Figure
 
 from creps_jax.policies.feature_settings import Features
 from creps_jax.tools import plots
-from creps_jax.tools.tables import PAPER_LINEAR, PAPER_RBF, save_table
-from experiments import comparison, walk
+from creps_jax.tools.tables import PAPER_LINEAR, PAPER_RBF
+from experiments import comparison
 from experiments.comparison import signed_rank_p
 from experiments.learning import Session
+from experiments.records import Arrays, Part, Walks, named
 from experiments.registry import Claim
+from experiments.walking import learning
+from experiments.walking.settings import SETTINGS as WALK_SETTINGS
+from experiments.walking.settings import Settings
 
 _PAPER = {
-    field.name: getattr(walk.SETTINGS["paper"], field.name)
-    for field in dataclasses.fields(walk.Settings)
+    field.name: getattr(WALK_SETTINGS["paper"], field.name)
+    for field in dataclasses.fields(Settings)
     if field.name not in ("robot", "low", "high", "iterations", "trials", "eval_seeds", "physics")
 }
 _PLAIN = (
@@ -40,12 +42,12 @@ CONTENDERS: dict[str, dict[str, Any]] = {
     "plain": {name: _PAPER[name] for name in _PLAIN},
     "paper": _PAPER,
 }
-"""What each changes of the settings; the paper compares constraints with linear policies.
+"""The settings that each contender changes; the paper compares constraints with linear policies.
 
-`unbounded` has the paper's fit and our samples and archive, `plain` has all of the paper's algorithm, `paper`
-its whole protocol: also its box of parameters, engine, noise, contexts and length of episodes. These two have
-other numbers of samples in the first iteration and after it, so that their episodes are others, too. With the
-settings of the preset `paper` they are `rbf`.
+`unbounded` has the paper's fit with our samples and archive. `plain` has the paper's algorithm. `paper` has
+the paper's protocol: also its bounds, engine, noise, contexts and length of episodes. The last two have other
+numbers of samples in an iteration, and therefore other episodes. With the preset `paper` they are the same as
+`rbf`.
 """
 
 LABELS = {
@@ -63,13 +65,12 @@ PANELS = {
     "Protocols": ("paper", "plain", "rbf"),
 }
 _SMOOTHED = 450
-"""Rollouts, the last ones, whose mean reward tells how far learning is: one fall in them is -0.2."""
+"""Rollouts over which rewards of samples are averaged: one fall among them is -0.2."""
 
-Settings = walk.Settings
 SETTINGS = {
-    "quick": dataclasses.replace(walk.SETTINGS["quick"], iterations=70, trials=5),
-    "paper": walk.SETTINGS["paper"],
-    "best": dataclasses.replace(walk.SETTINGS["best"], trials=5),
+    "quick": dataclasses.replace(WALK_SETTINGS["quick"], iterations=70, trials=5),
+    "paper": WALK_SETTINGS["paper"],
+    "best": dataclasses.replace(WALK_SETTINGS["best"], trials=5),
 }
 
 
@@ -77,98 +78,97 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     """Let all contenders learn from the same keys, and walk at the paper's speeds with fresh seeds.
 
     Returns:
-        `speeds` (n,), and for each NAME: `NAME.episodes` (iterations,), `NAME.sample_reward` and
-        `NAME.sample_fell` (trials, iterations), `NAME.reward`, `NAME.fell` (trials, n, seeds) and
-        `NAME.speed` (trials, n, seeds, 2). Also `rbf.halfway_reward` (trials, n, seeds), after half of the
-        episodes of `plain`.
+        `speeds` (n,), and a part for each contender: `episodes` (iterations,), `sample_reward` and
+        `sample_fell` (trials, iterations), and the fields of `Walks` (trials, n, seeds, ...). The part `rbf`
+        also has `halfway_reward` (trials, n, seeds), after half of the episodes of `plain`.
     """
     evaluate_key, learn_key = jax.random.split(key)
     arrays, policies = {}, {}
     for name, changes in CONTENDERS.items():
         changed = dataclasses.replace(settings, **changes)
-        states, log = walk.learn_to_walk(changed, learn_key, session=session, name=name)
+        states, log = learning.learn_to_walk(changed, learn_key, session=session, name=name)
         policies[name] = states.policy, log["coef"]
-        speeds, outcome = walk.walk_at_all_speeds(changed, evaluate_key, states.policy)
+        speeds, outcome = learning.walk_at_all_speeds(changed, evaluate_key, states.policy)
         arrays["speeds"] = speeds
-        # A resumed run may have gone on for longer than is asked of it now.
-        arrays[f"{name}.episodes"] = walk.make_plan(changed).episodes(np.arange(1, settings.iterations + 1))
-        arrays[f"{name}.sample_reward"] = log["mean_reward"][:, : settings.iterations]
-        arrays[f"{name}.sample_fell"] = log["outcome.fell"][:, : settings.iterations]
-        for field in ("reward", "fell", "speed"):
-            arrays[f"{name}.{field}"] = getattr(outcome, field)
-    is_within = arrays["rbf.episodes"] <= arrays["plain.episodes"][-1] / 2
+        # The log of a resumed run may be longer than the iterations of this one.
+        curves = {
+            "episodes": learning.make_plan(changed).episodes(np.arange(1, settings.iterations + 1)),
+            "sample_reward": log["mean_reward"][:, : settings.iterations],
+            "sample_fell": Part(log, "outcome")["fell"][:, : settings.iterations],
+        }
+        arrays |= named(name, {**curves, **Walks.of(outcome._asdict())._asdict()})
+    rbf, plain = Part(arrays, "rbf"), Part(arrays, "plain")
+    is_within = rbf["episodes"] <= plain["episodes"][-1] / 2
     final, coefs = policies["rbf"]
     halfway = final._replace(coef=coefs[:, max(is_within.sum() - 1, 0)])
-    _, outcome = walk.walk_at_all_speeds(settings, evaluate_key, halfway)
-    arrays["rbf.halfway_reward"] = outcome.reward
-    return arrays
+    _, outcome = learning.walk_at_all_speeds(settings, evaluate_key, halfway)
+    return arrays | named("rbf", {"halfway_reward": outcome.reward})
 
 
-def final_reward(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+def final_reward(arrays: Arrays, name: str) -> np.ndarray:
     """Return the mean reward (trials,) of each trial's mean policy over all speeds and seeds."""
-    return arrays[f"{name}.reward"].mean(axis=(1, 2))
+    return Part(arrays, name)["reward"].mean(axis=(1, 2))
 
 
-def p_value(arrays: Mapping[str, np.ndarray], better: str, worse: str) -> float:
-    """Return how likely rewards so much in favour of `better` are if it is no better, by Wilcoxon's test."""
+def p_value(arrays: Arrays, better: str, worse: str) -> float:
+    """Return the p-value of Wilcoxon's test that the rewards of `better` are higher."""
     return signed_rank_p(final_reward(arrays, better) - final_reward(arrays, worse))
 
 
-def share_of_episodes(arrays: Mapping[str, np.ndarray], reference: str) -> float:
-    """Return after which share of another's episodes the bounded fit is as good as that is after all."""
+def share_of_episodes(arrays: Arrays, reference: str) -> float:
+    """Return the share of a contender's episodes after which the bounded fit reaches its last reward."""
     episodes, bounded = _smoothed(arrays, "rbf")
     others, rewards = _smoothed(arrays, reference)
     return comparison.share_of_episodes(episodes, bounded, rewards, total=others[-1])
 
 
-def halfway_lack(arrays: Mapping[str, np.ndarray]) -> float:
-    """Return what our policies lack to reward zero after half of plain C-REPS's episodes, over its own lack.
+def halfway_ratio(arrays: Arrays) -> float:
+    """Return our reward after half of the episodes of plain C-REPS, divided by its last reward.
 
-    Of mean policies, by the medians of the trials: samples tell less, as each search explores by its own
-    covariance.
+    Both are medians of the trials, and rewards of mean policies: rewards of samples depend on the covariance.
     """
-    ours = -np.median(arrays["rbf.halfway_reward"].mean(axis=(1, 2)))
+    ours = -np.median(Part(arrays, "rbf")["halfway_reward"].mean(axis=(1, 2)))
     return float(ours / -np.median(final_reward(arrays, "plain")))
 
 
-def _smoothed(arrays: Mapping[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return how many rollouts there were (k,), and the mean rewards (trials, k) of the last `_SMOOTHED`."""
-    episodes, rewards = arrays[f"{name}.episodes"], arrays[f"{name}.sample_reward"]
-    # All iterations but the first have as many; a single one has no difference.
+def _sample_curve(arrays: Arrays, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the episodes (iterations,), and the mean rewards of the new samples (trials, iterations)."""
+    part = Part(arrays, name)
+    return part["episodes"], part["sample_reward"]
+
+
+def _smoothed(arrays: Arrays, name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the episodes (k,), and the mean rewards (trials, k) of the last `_SMOOTHED` rollouts."""
+    episodes, rewards = _sample_curve(arrays, name)
+    # All iterations except the first have the same number of rollouts; a single one has no difference.
     in_iteration = np.diff(episodes).max(initial=1)
     width = max(1, min(round(_SMOOTHED / in_iteration), rewards.shape[1]))
     windows = np.lib.stride_tricks.sliding_window_view(rewards, width, axis=1)
     return episodes[width - 1 :], windows.mean(axis=2)
 
 
-def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[object]]:
-    """Return Table 2 with the medians of our trials, and their falls, beside the paper's."""
+def table(arrays: Arrays) -> dict[str, list[object]]:
+    """Return Table 2: medians and falls of our trials, and the paper's values."""
     columns: dict[str, list[object]] = {"asked m/s": [round(float(speed), 3) for speed in arrays["speeds"]]}
     for name, label in LABELS.items():
-        columns[label] = [float(value) for value in np.median(arrays[f"{name}.reward"].mean(axis=2), axis=0)]
-        falls = arrays[f"{name}.fell"]
-        columns[f"{label}: falls"] = [f"{int(fell.sum())}/{fell.size}" for fell in np.swapaxes(falls, 0, 1)]
+        walks = Walks.of(Part(arrays, name))
+        columns[label] = [float(value) for value in np.median(walks.reward.mean(axis=2), axis=0)]
+        columns[f"{label}: falls"] = [f"{int(row.sum())}/{row.size}" for row in walks.fell.swapaxes(0, 1)]
     columns |= {"paper RBF": list(PAPER_RBF), "paper linear": list(PAPER_LINEAR)}
     return columns
 
 
-def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
-    """Draw Fig. 10 and 11a, and what each way came to."""
+def plot(arrays: Arrays) -> dict[str, Figure]:
+    """Draw Fig. 10 and 11a, and the last reward of each contender."""
     panels = {
-        title: {LABELS[name]: (arrays[f"{name}.episodes"], arrays[f"{name}.sample_reward"]) for name in names}
+        title: {LABELS[name]: _sample_curve(arrays, name) for name in names}
         for title, names in PANELS.items()
     }
     missing = {label: -final_reward(arrays, name) for name, label in LABELS.items()}
     return {
         "learning_curve": plots.learning_curves(panels),
-        "final": plots.final_values(missing, label="what the mean reward lacks to zero", log=True),
+        "final": plots.final_values(missing, label="negative mean reward", log=True),
     }
-
-
-def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
-    """Write and say the table."""
-    del settings
-    save_table(table(arrays), folder, say)
 
 
 CLAIMS = (
@@ -185,19 +185,19 @@ CLAIMS = (
         high=0.05,
     ),
     Claim(
-        "lack of the bounded fit's policies at half of plain C-REPS's episodes, over that one's in the end",
+        "reward of the bounded fit after half of plain C-REPS's episodes, divided by its last reward",
         None,
-        halfway_lack,
+        halfway_ratio,
         high=1.0,
     ),
     Claim(
-        "share of the episodes of plain C-REPS after which samples of the bounded fit are as good",
+        "share of plain C-REPS's episodes after which samples of the bounded fit reach its last reward",
         None,
         lambda arrays: share_of_episodes(arrays, "plain"),
         high=0.5,
     ),
     Claim(
-        "the same, for weighted ML with our samples and archive",
+        "the same for weighted ML with our samples and archive",
         None,
         lambda arrays: share_of_episodes(arrays, "unbounded"),
         high=0.5,

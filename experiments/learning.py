@@ -1,4 +1,4 @@
-"""Learn with progress to see and checkpoints to go on from."""
+"""Learn with a progress display and with checkpoints."""
 
 import dataclasses
 import time
@@ -17,6 +17,7 @@ from creps_jax.search.creps import Creps, CrepsState
 from creps_jax.tasks.base import Task
 from creps_jax.training import Samples, train_trials
 from experiments.progress import PooledSamples, Progress, Row
+from experiments.records import Part
 
 _SECONDS_BETWEEN_CHECKPOINTS = 2.0
 
@@ -25,13 +26,13 @@ Log = dict[str, np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Session:
-    """Where a run keeps what it needs to go on, and whom it tells how it gets on.
+    """The folder of the checkpoints of a run, and the console of its progress.
 
     Attributes:
-        folder: the result folder; None keeps nothing.
-        identity: what tells this run from others, see `save_checkpoint`.
-        console: where progress is shown; None shows nothing.
-        is_keeper: whether this process writes to the folder: one of those that share a run does.
+        folder: the result folder; None saves no checkpoints.
+        identity: identifies the checkpoints of this run, see `save_checkpoint`.
+        console: console of the progress; None shows none.
+        is_keeper: whether this process writes to the folder: one of the processes that share a run does.
     """
 
     folder: Path | None = None
@@ -42,14 +43,14 @@ class Session:
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """How long to learn, and with how many samples.
+    """The numbers of iterations and samples.
 
     Attributes:
-        iterations: number of iterations, those of an interrupted run included.
-        samples: new samples of an iteration, of each trial.
-        first_samples: new samples of the first iteration.
+        iterations: number of iterations, including the iterations of an interrupted run.
+        samples: new samples of each trial in an iteration.
+        first_samples: new samples of each trial in the first iteration; None is `samples`.
         repeats: rollouts of a sample.
-        timestep: physics time step in seconds, to count steps a second; None where there is none.
+        timestep: physics time step in seconds, to report steps per second; None without physics.
     """
 
     iterations: int
@@ -59,13 +60,13 @@ class Plan:
     timestep: float | None = None
 
     def episodes(self, iteration: np.ndarray | int) -> Any:
-        """Count the rollouts of a trial up to and including an iteration, which counts from 1."""
+        """Count the rollouts of a trial until the end of an iteration; the first iteration is 1."""
         first = self.samples if self.first_samples is None else self.first_samples
         return self.repeats * (first + self.samples * (np.asarray(iteration) - 1))
 
 
 def trial_keys(key: jax.Array, trials: int) -> jax.Array:
-    """Return a key for each trial; a trial has the same one however many there are."""
+    """Return a key for each trial; it does not depend on the number of trials."""
     return jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.arange(trials, dtype=jnp.uint32))
 
 
@@ -80,25 +81,25 @@ def learn(
     name: str,
     devices: Sequence[jax.Device] | None = None,
 ) -> tuple[CrepsState, Log]:
-    """Run all trials at once, or the rest of them where the session's folder holds a checkpoint.
+    """Run all trials at once; continue from the checkpoint in the session's folder if there is one.
 
     Args:
         keys: (trials,) key of each trial.
-        task: what to learn.
-        algorithm: what learns it.
+        task: the task.
+        algorithm: the search.
         policy: the first policy of every trial.
         plan: iterations and samples.
-        session: where to keep checkpoints and show progress.
-        name: names the checkpoint, `checkpoint-NAME.npz`, and heads the progress.
-        devices: devices that share the rollouts, by default those of all processes.
+        session: where to save checkpoints and show progress.
+        name: name of the checkpoint, `checkpoint-NAME.npz`, and title of the progress.
+        devices: devices that share the rollouts; all devices of all processes by default.
 
     Returns:
-        The last states (trials, ...), and the logs by name (trials, iterations, ...); `coef` among
-        them is the mean policy's after each iteration.
+        The last states (trials, ...), and the logs by name (trials, iterations, ...). `coef` are the
+        coefficients of the policy after each iteration; parts are `info` and `outcome`, see `records.Part`.
 
     Raises:
-        KeyboardInterrupt: once the last whole iteration is saved.
-        UserError: if the checkpoint is unreadable, of another run, or cannot be written.
+        KeyboardInterrupt: after the last complete iteration is saved.
+        UserError: if the checkpoint is unreadable, belongs to another run, or cannot be written.
     """
     first = algorithm.init(policy)
     states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(keys), *leaf.shape)), first)
@@ -116,7 +117,7 @@ def learn(
     earlier = latest.log["mean_reward"].mean(axis=1) if latest.log else np.zeros(0)
     done = len(earlier)
     if done < plan.iterations:
-        lost = latest.log["info.unsupported_loss"].mean(axis=1).sum() if latest.log else 0.0
+        lost = Part(latest.log, "info")["unsupported_loss"].mean(axis=1).sum() if latest.log else 0.0
         with _Reporter(name, plan, earlier=earlier, lost=lost, console=session.console) as report, keeper:
 
             def on_iteration(state: CrepsState, log: Any) -> None:
@@ -135,12 +136,12 @@ def learn(
                 devices=jax.devices() if devices is None else devices,
             )
     latest = keeper.latest
-    # A run that is resumed with fewer iterations than it has keeps what it has.
+    # A run that is resumed with fewer iterations than it has keeps all of them.
     return latest.state, {field: np.swapaxes(values, 0, 1) for field, values in latest.log.items()}
 
 
 class _Keeper:
-    """Save the latest iteration now and then, and on the way out, whatever the way."""
+    """Save the latest iteration from time to time, and at the end, also after an error."""
 
     def __init__(self, latest: Checkpoint, save: Callable[[Checkpoint], Any]):
         self.latest = latest
@@ -156,7 +157,7 @@ class _Keeper:
             self._write()
 
     def take(self, state: CrepsState, log: Any) -> None:
-        # One assignment: an interrupt finds the iteration either here whole or not at all.
+        # A single assignment: an interrupt cannot leave a part of an iteration.
         row = {**named_leaves(log._replace(samples=None)), "coef": np.asarray(state.policy.coef)}
         self.latest = Checkpoint(state, append_log(self.latest.log, row))
         if time.monotonic() - self._saved_at >= _SECONDS_BETWEEN_CHECKPOINTS:
@@ -168,7 +169,7 @@ class _Keeper:
 
 
 class _Reporter:
-    """Turn the logs of iterations into rows of progress."""
+    """Make rows of progress from the logs of iterations."""
 
     def __init__(self, name: str, plan: Plan, *, earlier: np.ndarray, lost: float, console: Console | None):
         self._plan, self._done, self._lost = plan, len(earlier), lost
@@ -215,9 +216,9 @@ class _Reporter:
 
 
 def pooled(samples: Samples) -> PooledSamples:
-    """Return the new samples (trials, n, ...) of all trials as the progress view takes them.
+    """Return the new samples (trials, n, ...) of all trials for the progress display.
 
-    The outcome of a walk has its forward speed first, and its context the speed that was asked for.
+    The first variable of a walk's context is the asked speed, and the first of its speeds the forward speed.
     """
     outcome = samples.outcome
     fell, speed = getattr(outcome, "fell", None), getattr(outcome, "speed", None)

@@ -1,16 +1,15 @@
-"""Hold the bounded fit of the policy against the paper's, on test functions and all tasks but walking.
+"""Compare the paper's fit of the policy with the bounded fit, on test functions and all tasks but walking.
 
-Each has the archive that it does best with: without bounds a long one, which slows the policy down as bounds
-do; with bounds a short one, as older samples say less. The paper's fit with the short one tells what the
-archive does from what the bounds do, and the bounded one whose samples are weighed by importance what these
-weights do. The functions also show the paper's fit without an archive.
+Each fit has the archive with which it learns best. Without bounds this is a long archive, which slows the
+policy down as bounds do; with bounds it is a short one, as older samples fit the policy less. Two more
+contenders separate the effects: the paper's fit with the short archive, and the bounded fit with importance
+weights. On the functions the paper's fit also learns without an archive.
 """
 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -23,10 +22,10 @@ from creps_jax.policies.features import FeatureMap, linear_features, rbf_feature
 from creps_jax.tasks import Task, contextual_function, hole_reaching, sinus, via_point_reaching
 from creps_jax.tasks.functions import ackley, ellipsoid, rastrigin, rosenbrock, sphere
 from creps_jax.tools import plots
-from creps_jax.tools.tables import save_table
 from experiments import comparison
 from experiments.comparison import Contender, LearnerSettings, compare, make_contender, mean_policy_curve
 from experiments.learning import Session
+from experiments.records import Arrays, Part, named, parts_with, traces
 from experiments.registry import Claim
 
 LABELS = {
@@ -45,7 +44,7 @@ FUNCTIONS = {
 }
 THETA_DIM, CONTEXT_DIM = 20, 2
 SIGNIFICANCE = 0.1
-"""Of the evidence that the bounded fits ask for; weighted ML is the paper's, which asks for none."""
+"""Significance of the test on evidence in the bounded fits; weighted ML, the paper's fit, has no test."""
 FUNCTION_KL_BOUNDS = (1.0, 0.05)
 """Bounds of the bounded fit on the change of mean and covariance on the functions, nats."""
 
@@ -71,7 +70,7 @@ SETTINGS = {"best": Settings(), "quick": Settings(trials=4)}
 
 
 class Bench(NamedTuple):
-    """Who learns a task, by fit, and the contexts to judge them on."""
+    """The contenders of a task, by fit, and the contexts of the evaluation."""
 
     contenders: Mapping[str, Contender]
     grid: jax.Array
@@ -86,7 +85,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         bench = make(setup_key, plan)
         contenders = {f"{name}-{fit}": contender for fit, contender in bench.contenders.items()}
         found = compare(contenders, plan, learn_key, grid=bench.grid, session=session)
-        arrays |= {f"{name}/{field}": values for field, values in found.items()}
+        arrays |= named(name, found, "/")
     return arrays
 
 
@@ -114,12 +113,12 @@ def _function_bench(
 def _with_bounds(
     learner: LearnerSettings, archive_size: int, mean_kl_bound: float, cov_kl_bound: float
 ) -> dict[str, LearnerSettings]:
-    """Return a learner with a shorter archive, the same within bounds, and that with importance weights."""
+    """Return a learner with a short archive, with bounds too, and with importance weights too."""
     short = dataclasses.replace(learner, archive_size=archive_size)
     bounded = dataclasses.replace(
         short, mean_kl_bound=mean_kl_bound, cov_kl_bound=cov_kl_bound, significance=SIGNIFICANCE
     )
-    # As many policies as have samples in the archive.
+    # The number of policies that have samples in the archive.
     importance = dataclasses.replace(bounded, importance_policies=math.ceil(archive_size / learner.samples))
     return {"short": short, "bounded": bounded, "importance": importance}
 
@@ -167,30 +166,29 @@ BENCHES: dict[str, Callable[[jax.Array, LearnerSettings], Bench]] = {
 }
 
 
-def of_bench(arrays: Mapping[str, np.ndarray], bench: str) -> dict[str, np.ndarray]:
-    """Return the arrays of one task, as `compare` named them."""
-    prefix = f"{bench}/"
-    return {name.removeprefix(prefix): values for name, values in arrays.items() if name.startswith(prefix)}
+def of_bench(arrays: Arrays, bench: str) -> Part:
+    """Return the arrays of one task, as `compare` returned them."""
+    return Part(arrays, bench, "/")
 
 
-def fits(arrays: Mapping[str, np.ndarray], bench: str) -> dict[str, str]:
-    """Return the contenders of a task by their labels."""
-    found = of_bench(arrays, bench)
-    return {label: f"{bench}-{fit}" for fit, label in LABELS.items() if f"{bench}-{fit}.coef" in found}
+def fits(arrays: Arrays, bench: str) -> dict[str, str]:
+    """Return the contenders of a task by the labels of their fits."""
+    contenders = parts_with(of_bench(arrays, bench), "coef")
+    return {label: name for fit, label in LABELS.items() if (name := f"{bench}-{fit}") in contenders}
 
 
-def share_of_episodes(arrays: Mapping[str, np.ndarray], bench: str) -> float:
-    """Return in which share of the episodes the bounded fit is as good as the paper's after all of them."""
+def share_of_episodes(arrays: Arrays, bench: str) -> float:
+    """Return the share of the episodes after which the bounded fit reaches the paper's last reward."""
     found = of_bench(arrays, bench)
     episodes, bounded = mean_policy_curve(found, f"{bench}-bounded")
     _, archive = mean_policy_curve(found, f"{bench}-archive")
     return comparison.share_of_episodes(episodes, bounded, archive)
 
 
-def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
-    """Return the table of the last mean policies, and of the episodes that it took.
+def table(arrays: Arrays) -> dict[str, list[str]]:
+    """Return the rewards of the last mean policies and the share of episodes.
 
-    Rewards are medians of the trials, with their intervals where there are trials enough.
+    Rewards are medians of the trials, with intervals if there are enough trials.
     """
     columns: dict[str, list[str]] = {"task": list(BENCHES)}
     for label in LABELS.values():
@@ -204,8 +202,8 @@ def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
     return columns
 
 
-def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
-    """Draw the learning curves on each task, and how the updates on the sphere went."""
+def plot(arrays: Arrays) -> dict[str, Figure]:
+    """Draw the learning curves of each task, and traces of the updates on the sphere."""
     panels = {
         bench: {
             label: mean_policy_curve(of_bench(arrays, bench), contender)
@@ -214,29 +212,24 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
         for bench in BENCHES
     }
     found = of_bench(arrays, "sphere")
-    traces = {
-        label: {field: found[f"{contender}.{field}"] for field in plots.TRACES}
-        for label, contender in fits(arrays, "sphere").items()
-    }
+    updates = {label: traces(Part(found, name)) for label, name in fits(arrays, "sphere").items()}
     return {
         "learning_curves": plots.learning_curves(panels, columns=4, share=False),
-        "sphere_updates": plots.update_traces(found["episodes"], traces),
+        "sphere_updates": plots.update_traces(found["episodes"], updates),
     }
 
 
-def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
-    """Write and say the table."""
-    del settings
-    save_table(table(arrays), folder, say)
+def _on_sphere(arrays: Arrays, fit: str) -> Part:
+    return Part(of_bench(arrays, "sphere"), f"sphere-{fit}")
 
 
-def _last_samples(arrays: Mapping[str, np.ndarray], contender: str) -> float:
-    return float(of_bench(arrays, "sphere")[f"sphere-{contender}.sample_reward"][:, -1].mean())
+def _last_samples(arrays: Arrays, fit: str) -> float:
+    return float(_on_sphere(arrays, fit)["sample_reward"][:, -1].mean())
 
 
-def _largest_move(arrays: Mapping[str, np.ndarray]) -> float:
-    """Return the largest relative entropy of the bounded fit on the sphere, as a share of its bound."""
-    return float(of_bench(arrays, "sphere")["sphere-bounded.policy_kl"].max() / sum(FUNCTION_KL_BOUNDS))
+def _largest_kl(arrays: Arrays) -> float:
+    """Return the largest KL divergence of the bounded fit on the sphere, divided by its bound."""
+    return float(_on_sphere(arrays, "bounded")["policy_kl"].max() / sum(FUNCTION_KL_BOUNDS))
 
 
 CLAIMS = (
@@ -252,10 +245,10 @@ CLAIMS = (
         lambda arrays: _last_samples(arrays, "bounded"),
         low=-1e-4,
     ),
-    Claim("sphere, bounded: largest move of the policy, of its bound", None, _largest_move, high=1.01),
+    Claim("sphere, bounded: largest KL of the policy, divided by its bound", None, _largest_kl, high=1.01),
     *(
         Claim(
-            f"{bench}: share of episodes in which the bounded fit is as good as weighted ML after all",
+            f"{bench}: share of episodes after which the bounded fit is as good as weighted ML after all",
             None,
             lambda arrays, bench=bench: share_of_episodes(arrays, bench),
             high=0.5,

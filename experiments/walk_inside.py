@@ -1,9 +1,8 @@
-"""Look inside a walk that stays up and one that falls: what is planned, and what the robot does."""
+"""Measure plan and motion of a walk that stays up and of one that falls."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -19,16 +18,16 @@ from creps_jax.robots.nao_geometry import JOINT_NAMES
 from creps_jax.tasks.walking import WalkNoise, record_walk
 from creps_jax.tools import plots
 from creps_jax.tools.play import balance_of, load_walking_policy
-from creps_jax.tools.tables import save_table
 from creps_jax.walking.engine import plan_walk
 from creps_jax.walking.params import params_from_theta
 from creps_jax.walking.posture import Balance
 from creps_jax.walking.zmp import zmp_reference
 from experiments.learning import Session
 from experiments.probe import Measured, Probe
+from experiments.records import Arrays, Part, named
 from experiments.registry import Claim
 
-GAITS = {"good": "steps answer to the tilt", "bad": "the same gait, but they do not"}
+GAITS = {"good": "with foot placement", "bad": "without foot placement"}
 KNEE = JOINT_NAMES.index("left_knee")
 WINDOW = 1.2
 
@@ -39,9 +38,9 @@ class Settings:
 
     Attributes:
         speed: asked speed, m/s.
-        noise: how many times the usual noise.
+        noise: factor of the usual noise.
         duration: length of an episode, s.
-        candidates: seeds among which one is looked for, with which the bad gait falls and the good does not.
+        candidates: number of seeds to try until the bad gait falls and the good one does not.
     """
 
     speed: float = 0.6
@@ -57,8 +56,8 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     """Walk with the shipped policy, with its foot placement and without, in the same noise.
 
     Returns:
-        For each GAIT `GAIT.FIELD` of `Measured` until it falls, and `GAIT.zmp_plan` and `GAIT.com_plan`: the
-        lateral plan at the same times, from the middle of the feet, m.
+        A part for each of `GAITS`: the fields of `Measured` until the robot falls, and `zmp_plan` and
+        `com_plan`: the lateral plan at the same times, from the middle of the feet, m.
 
     Raises:
         UserError: if no seed among the candidates makes the bad gait fall and the good one not.
@@ -78,20 +77,19 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         )
     arrays = {}
     for name, walk in {"good": good, "bad": bad}.items():
-        fields = walk.upright._asdict() | _plan(theta, walk.upright.time)
-        arrays |= {f"{name}.{field}": values for field, values in fields.items()}
+        arrays |= named(name, walk.upright._asdict() | _plan(theta, walk.upright.time))
     return arrays
 
 
 class _Walked(NamedTuple):
-    """A walk, as far as the robot stayed upright."""
+    """A walk until the robot falls."""
 
     upright: Measured
     fell: bool
 
 
 class _Walker:
-    """Walk again and again with the same compiled program, and measure."""
+    """Walk many times with the same compiled program, and measure."""
 
     def __init__(self, settings: Settings, balance: Balance):
         self._probe = Probe()
@@ -127,29 +125,25 @@ def _plan(theta: jax.Array, times: np.ndarray) -> dict[str, np.ndarray]:
     return {"zmp_plan": np.asarray(zmp)[:, 1] - middle, "com_plan": com - middle}
 
 
-def inside(arrays: Mapping[str, np.ndarray], name: str) -> dict[str, np.ndarray]:
-    """Return what is drawn and tabled of a gait: arrays by name, the numbers in them finite."""
-    get = lambda field: arrays[f"{name}.{field}"]  # noqa: E731
-    heading = np.asarray(jax.vmap(quat_to_rpy)(jnp.float32(get("quat"))))
-    middle = get("soles")[:, :, 1].mean(axis=1)
-    loaded_speed = np.linalg.norm(get("sole_velocity")[..., :2], axis=2) * get("is_loaded")
-    return {
-        "time": get("time"),
-        "zmp": get("zmp")[:, 1] - middle,
-        "com": get("com")[:, 1] - middle,
-        "zmp_plan": get("zmp_plan"),
-        "com_plan": get("com_plan"),
-        "error": get("joint_pos") - get("set_point"),
-        "heights": get("soles")[..., 2],
-        "slip": loaded_speed.min(axis=1, where=get("is_loaded"), initial=np.inf),
-        "torque_share": get("torque_share"),
+def inside(arrays: Arrays, name: str) -> dict[str, np.ndarray]:
+    """Return the arrays of a gait that the figure and the table show."""
+    part = Part(arrays, name)
+    heading = np.asarray(jax.vmap(quat_to_rpy)(jnp.float32(part["quat"])))
+    middle = part["soles"][:, :, 1].mean(axis=1)
+    loaded_speed = np.linalg.norm(part["sole_velocity"][..., :2], axis=2) * part["is_loaded"]
+    same = ("time", "zmp_plan", "com_plan", "joint_pos", "set_point", "torque_share", "is_loaded")
+    return {field: part[field] for field in same} | {
+        "forward": part["com"][:, 0],
+        "zmp": part["zmp"][:, 1] - middle,
+        "com": part["com"][:, 1] - middle,
+        "heights": part["soles"][..., 2],
+        "slip": loaded_speed.min(axis=1, where=part["is_loaded"], initial=np.inf),
         "rpy": np.unwrap(heading, axis=0),
-        "is_loaded": get("is_loaded"),
     }
 
 
-def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[object]]:
-    """Return what limits each gait, in numbers, over its time upright."""
+def table(arrays: Arrays) -> dict[str, list[object]]:
+    """Return what limits each gait, in numbers, while the robot is upright."""
     columns: dict[str, list[object]] = {
         "measured": [
             "upright, s",
@@ -167,7 +161,7 @@ def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[object]]:
     }
     for name in GAITS:
         seen = inside(arrays, name)
-        forward = arrays[f"{name}.com"][:, 0]
+        forward = seen["forward"]
         rms = lambda x: float(np.sqrt(np.nanmean(np.square(x))))  # noqa: E731
         step = seen["time"][1] - seen["time"][0]
         slid = np.sum(np.where(np.isfinite(seen["slip"]), seen["slip"], 0.0)) * step
@@ -177,7 +171,7 @@ def table(arrays: Mapping[str, np.ndarray]) -> dict[str, list[object]]:
             float((forward[-1] - forward[0]) / seen["time"][-1]),
             1e3 * rms(seen["zmp"] - seen["zmp_plan"]),
             1e3 * rms(seen["com"] - seen["com_plan"]),
-            float(np.degrees(rms(seen["error"][:, -12:]))),
+            float(np.degrees(rms((seen["joint_pos"] - seen["set_point"])[:, -12:]))),
             100.0 * float(np.mean(seen["torque_share"] > 0.999)),
             1e3 * slid / float(forward[-1] - forward[0]),
             1e3 * float(np.median(lifts)),
@@ -194,22 +188,21 @@ def _peaks(heights: np.ndarray) -> np.ndarray:
     return inner[(inner > heights[:-2]) & (inner >= heights[2:]) & (inner > 0.005)]
 
 
-def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
+def plot(arrays: Arrays) -> dict[str, Figure]:
     """Draw both gaits side by side: a second before the bad one falls, and the tilt all the way."""
     figure, axes = plots.new_figure(5, 2, width=11.0, height=12.0, sharey="row")
-    end = float(arrays["bad.time"][-1])
-    for column, (name, label) in zip(axes.T, GAITS.items(), strict=True):
-        seen = inside(arrays, name)
+    gaits = {name: inside(arrays, name) for name in GAITS}
+    end = float(gaits["bad"]["time"][-1])
+    for column, (name, seen) in zip(axes.T, gaits.items(), strict=True):
         near = (seen["time"] > end - WINDOW) & (seen["time"] <= end)
-        shown = {field: values[near] for field, values in seen.items()}
-        _draw(column, shown, arrays[f"{name}.joint_pos"][near], arrays[f"{name}.set_point"][near])
-        column[0].set_title(label)
+        _draw(column, {field: values[near] for field, values in seen.items()})
+        column[0].set_title(GAITS[name])
         roll, _, yaw = np.degrees(seen["rpy"]).T
         column[4].plot(seen["time"], roll, label="roll")
         column[4].plot(seen["time"], yaw, label="heading")
         column[4].axvspan(end - WINDOW, end, color=plots.PAPER_COLOUR, alpha=0.2, lw=0)
-        # One scale for both, though one of the walks ends in a fall.
-        column[4].set_xlim(0.0, max(arrays[f"{each}.time"][-1] for each in GAITS))
+        # One scale for both, although one of the walks ends early.
+        column[4].set_xlim(0.0, max(each["time"][-1] for each in gaits.values()))
         column[4].set_xlabel("time (s); the grey part is shown above")
     for row, label in zip(
         axes[:, 0],
@@ -229,17 +222,15 @@ def plot(arrays: Mapping[str, np.ndarray]) -> dict[str, Figure]:
     return {"inside": figure}
 
 
-def _draw(
-    axes: np.ndarray, seen: Mapping[str, np.ndarray], joint_pos: np.ndarray, set_point: np.ndarray
-) -> None:
+def _draw(axes: np.ndarray, seen: Mapping[str, np.ndarray]) -> None:
     time = seen["time"]
     lines: list[tuple[Axes, np.ndarray, str, str, str]] = [
         (axes[0], 1e3 * seen["zmp_plan"], "ZMP, reference", "--", plots.COLOURS[0]),
         (axes[0], 1e3 * seen["zmp"], "ZMP", "-", plots.COLOURS[0]),
         (axes[0], 1e3 * seen["com_plan"], "CoM, plan", "--", plots.COLOURS[1]),
         (axes[0], 1e3 * seen["com"], "CoM", "-", plots.COLOURS[1]),
-        (axes[1], np.degrees(set_point[:, KNEE]), "set-point", "--", plots.COLOURS[0]),
-        (axes[1], np.degrees(joint_pos[:, KNEE]), "measured", "-", plots.COLOURS[1]),
+        (axes[1], np.degrees(seen["set_point"][:, KNEE]), "set-point", "--", plots.COLOURS[0]),
+        (axes[1], np.degrees(seen["joint_pos"][:, KNEE]), "measured", "-", plots.COLOURS[1]),
         (axes[2], seen["torque_share"], "", "-", plots.COLOURS[0]),
         (axes[3], 1e3 * seen["heights"][:, 0], "left", "-", plots.COLOURS[0]),
         (axes[3], 1e3 * seen["heights"][:, 1], "right", "-", plots.COLOURS[1]),
@@ -247,12 +238,6 @@ def _draw(
     for place, values, label, style, colour in lines:
         place.plot(time, values, style, color=colour, label=label, lw=1.4)
     axes[2].axhline(1.0, color=plots.FALL_COLOUR, lw=1.0)
-
-
-def finish(settings: Settings, arrays: Mapping[str, np.ndarray], folder: Path, say: Callable) -> None:
-    """Write and say the table."""
-    del settings
-    save_table(table(arrays), folder, say)
 
 
 CLAIMS: tuple[Claim, ...] = ()

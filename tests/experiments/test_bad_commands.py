@@ -16,6 +16,7 @@ from creps_jax.tools.session import plain, storage
 from creps_jax.tools.session.settings import Settings
 from experiments import walk
 from experiments.cli import main
+from experiments.walking import learning as walk_learning
 from tests.tools.test_robot_session import DEFINITION, fill
 
 Mistake = tuple[list[str], str]
@@ -135,7 +136,7 @@ def folder(tiny):
         Path(name).mkdir()
     Path("full/notes.txt").write_text("mine")
     quick = walk.SETTINGS["quick"]
-    policy = walk.as_learned(quick, walk.first_policy(quick))
+    policy = walk_learning.as_learned(quick, walk_learning.first_policy(quick))
     policy.save(Path("whole.npz"))
     Path("cut.npz").write_bytes(Path("whole.npz").read_bytes()[:-100])
     arrays = files.load_arrays(Path("whole.npz"))

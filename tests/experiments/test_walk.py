@@ -13,6 +13,7 @@ import pytest
 
 from creps_jax import files
 from creps_jax.errors import UserError
+from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.learned import load
 from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.simulation import c
@@ -33,8 +34,10 @@ from creps_jax.walking.params import (
     PARAM_NAMES,
 )
 from creps_jax.walking.posture import Balance
-from experiments import fig11_walk, runner, walk, walk_slope
+from experiments import claims, fig11_walk, request, runner, walk, walk_slope
 from experiments.cli import main
+from experiments.walking import learning as walk_learning
+from experiments.walking.settings import PHYSICS
 
 SHIPPED = shipped_policy()
 
@@ -58,7 +61,7 @@ def bench(tmp_path, monkeypatch):
     filmed = []
     clips = [Clip("asked 0.30 m/s, reached 0.30 m/s", np.zeros((5, 29)), 0.02)]
     settings = walk.Settings(iterations=2, trials=2, eval_seeds=3, first_samples=30, samples=30)
-    monkeypatch.setattr(walk, "nao_walk", stand_in)
+    monkeypatch.setattr(walk_learning, "nao_walk", stand_in)
     for module in (walk, play):
         monkeypatch.setattr(module, "record", lambda policy, speeds, **_: (policy.theta(speeds[0]), clips)[1])
     monkeypatch.setattr(play, "write_video", lambda path, *_, **__: filmed.append(path))
@@ -68,7 +71,7 @@ def bench(tmp_path, monkeypatch):
 
 
 def test_the_result_folder_is_complete(bench):
-    folder = runner.run(runner.Request("walk", walk.SETTINGS["quick"]), console=None, say=lambda _: None)
+    folder = runner.run(request.Request("walk", walk.SETTINGS["quick"]), console=None, say=lambda _: None)
     names = "arrays.npz manifest.json checkpoint-walk.npz claims.md policy.npz table.csv table.md"
     figures = "learning_curve.png parameters.png speed.png updates.png"
     assert {path.name for path in folder.iterdir()} == {*names.split(), *figures.split()}
@@ -97,13 +100,13 @@ def test_the_result_folder_is_complete(bench):
 
 def test_the_policy_is_kept_that_walks_best_in_the_noise_of_learning(bench, monkeypatch):
     asked = []
-    walk_at_all_speeds = walk.walk_at_all_speeds
+    walk_at_all_speeds = walk_learning.walk_at_all_speeds
 
     def watched(settings, key, policy, *, noise=1.0):
         asked.append((noise, jax.random.key_data(key).tolist()))
         return walk_at_all_speeds(settings, key, policy, noise=noise)
 
-    monkeypatch.setattr(walk, "walk_at_all_speeds", watched)
+    monkeypatch.setattr(walk_learning, "walk_at_all_speeds", watched)
     arrays = walk.run(dataclasses.replace(walk.SETTINGS["quick"], learning_noise=1.6), jax.random.key(0))
     assert [noise for noise, _ in asked] == [1.6, 1.0]
     # What chooses does not judge.
@@ -129,7 +132,7 @@ def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
     assert (first["penalty"] < first["linear"] - 100).all()
     assert set(fig11_walk.plot(arrays)) == {"learning_curve", "final"}
     said = []
-    fig11_walk.finish(settings, arrays, tmp_path, said.append)
+    tables.save_table(fig11_walk.table(arrays), tmp_path, said.append)
     assert (tmp_path / "table.md").read_text() == said[0]
     assert len(said[0].splitlines()) == 2 + 11 and "-3338.082" in said[0]
     for claim in fig11_walk.CLAIMS:
@@ -141,7 +144,7 @@ def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
     assert fig11_walk.share_of_episodes(curves, "plain") == pytest.approx(810 / 930)
     assert arrays["rbf.halfway_reward"].shape == (2, 11, 3)
     lacks = {"rbf.halfway_reward": np.full((3, 2, 2), -1.0), "plain.reward": np.full((3, 2, 2), -4.0)}
-    assert fig11_walk.halfway_lack(lacks) == 0.25
+    assert fig11_walk.halfway_ratio(lacks) == 0.25
     lack = 1.0 / np.arange(1.0, 6.0)[:, None, None]
     assert fig11_walk.p_value({"a.reward": -lack, "b.reward": -2 * lack}, "a", "b") == pytest.approx(2.0**-5)
 
@@ -149,7 +152,7 @@ def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
 def test_a_penalised_search_starts_where_a_squashed_one_does():
     settings = dataclasses.replace(walk.SETTINGS["quick"], constraint="penalty")
     low, high = (np.array(bound) for bound in settings.box())
-    start = walk.first_policy(settings)
+    start = walk_learning.first_policy(settings)
     np.testing.assert_allclose(start.coef[0], low + (high - low) / (1 + np.exp(0.3)), rtol=1e-5, atol=1e-6)
     # The slope of the sigmoid there, 0.244, times the standard deviation of one before it.
     np.testing.assert_allclose(jnp.diagonal(start.cov_chol), 0.2445 * (high - low), rtol=1e-3)
@@ -172,7 +175,7 @@ def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
         assert match in error
         assert len(error.splitlines()) == 1
     settings = walk.SETTINGS["quick"]
-    walk.as_learned(settings, walk.first_policy(settings)).save(Path("p.npz"))
+    walk_learning.as_learned(settings, walk_learning.first_policy(settings)).save(Path("p.npz"))
     assert tools(["play", "--speed", "0.9", "--policy", "p.npz"]) == 2
     assert "within its range, 0.1 to 0.6 m/s, got 0.9" in capsys.readouterr().err
     assert tools(["play", "--speed", "0.5", "--policy", "p.npz"]) == 0
@@ -181,11 +184,11 @@ def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
 @pytest.mark.parametrize("task", [{"heading_gain": 0.3}, {"balance": {"ankle": 1.0}}, {"balance": None}])
 def test_a_policy_that_was_balanced_otherwise_is_refused(tmp_path, task):
     settings = walk.SETTINGS["quick"]
-    saved = walk.as_learned(settings, walk.first_policy(settings))
+    saved = walk_learning.as_learned(settings, walk_learning.first_policy(settings))
     saved.save(tmp_path / "p.npz")
     assert balance_of(load_walking_policy(tmp_path / "p.npz")) == Balance(0.3, 0.6) == settings.balance()
     dataclasses.replace(saved, task=task).save(tmp_path / "p.npz")
-    with pytest.raises(UserError, match=r"p.npz does not say how its steps were balanced: expected heading"):
+    with pytest.raises(UserError, match=r"p.npz must have the balance of its steps, heading"):
         load_walking_policy(tmp_path / "p.npz")
 
 
@@ -195,7 +198,7 @@ def test_a_machine_without_opengl_only_lacks_the_video(bench, monkeypatch):
 
     monkeypatch.setattr(play, "write_video", fail)
     settings, said = walk.SETTINGS["quick"], []
-    walk.as_learned(settings, walk.first_policy(settings)).save(Path("p.npz"))
+    walk_learning.as_learned(settings, walk_learning.first_policy(settings)).save(Path("p.npz"))
     play.show([0.3], Path("p.npz"), out=Path("walk.mp4"), seed=0, say=said.append)
     assert said[-2].startswith("asked 0.30")
     assert "apt-get" in said[-1]
@@ -203,8 +206,8 @@ def test_a_machine_without_opengl_only_lacks_the_video(bench, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["linear", "rbf"])
 def test_the_first_policy_is_the_same_for_every_speed(kind):
-    settings = walk.Settings(features=walk.Features(kind), start_mean=-0.5, low=0.1, high=0.6)
-    policy = walk.as_learned(settings, walk.first_policy(settings))
+    settings = walk.Settings(features=Features(kind), start_mean=-0.5, low=0.1, high=0.6)
+    policy = walk_learning.as_learned(settings, walk_learning.first_policy(settings))
     for speed in (0.1, 0.25, 0.6):
         np.testing.assert_allclose(policy.mean(speed), np.full(10, -0.5), rtol=1e-5)
 
@@ -236,22 +239,24 @@ def test_each_context_can_have_its_own_number_of_centres_on_the_command_line(cap
 def test_a_run_can_go_on_from_a_policy(tmp_path):
     settings = walk.SETTINGS["best"]
     shipped = dataclasses.replace(settings, start_policy=str(SHIPPED))
-    start, loaded = walk.first_policy(shipped), load(SHIPPED)
+    start, loaded = walk_learning.first_policy(shipped), load(SHIPPED)
     jax.tree.map(np.testing.assert_array_equal, start, loaded.policy)
-    for other in ({"bounds": "paper"}, {"features": walk.Features("rbf", 4)}, {"high": 0.5}):
+    for other in ({"bounds": "paper"}, {"features": Features("rbf", 4)}, {"high": 0.5}):
         with pytest.raises(UserError, match=r"walk\.npz has other features or bounds"):
-            walk.first_policy(dataclasses.replace(shipped, **other))
+            walk_learning.first_policy(dataclasses.replace(shipped, **other))
 
 
 def test_settings_come_back_from_a_manifest():
-    settings = walk.Settings(features=walk.Features("linear"))
+    settings = walk.Settings(features=Features("linear"))
     assert walk.Settings(**dataclasses.asdict(settings)) == settings
 
 
 def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monkeypatch, tmp_path):
     asked = {}
     monkeypatch.setattr(
-        walk, "nao_walk", lambda *bounds, **settings: asked.update(settings) or stand_in(*bounds, **settings)
+        walk_learning,
+        "nao_walk",
+        lambda *bounds, **settings: asked.update(settings) or stand_in(*bounds, **settings),
     )
     np.testing.assert_array_equal(walk.Settings().speeds(), np.float32(tables.PAPER_SPEEDS))
     assert walk.Settings().box() == NAO_BOUNDS
@@ -259,14 +264,16 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
     assert settings.box() == NAO_H25_BOUNDS
     assert dataclasses.replace(settings, bounds="paper").box() == PAPER_BOUNDS
     assert dataclasses.replace(settings, bounds="author").box() == AUTHOR_BOUNDS
-    contexts = jax.vmap(walk.make_task(settings).sample_context)(jax.random.split(jax.random.key(0), 500))
+    contexts = jax.vmap(walk_learning.make_task(settings).sample_context)(
+        jax.random.split(jax.random.key(0), 500)
+    )
     assert asked["robot"] is NAO_H25
     low, high = ROBOTS["nao_h25"].low, ROBOTS["nao_h25"].high
     np.testing.assert_allclose([contexts.min(), contexts.max()], [low - 0.02, high + 0.02], atol=5e-3)
     np.testing.assert_allclose(settings.speeds()[[0, -1]], [low, high], rtol=1e-6)
     assert not tables.are_the_papers(settings.speeds())
 
-    saved = walk.as_learned(settings, walk.first_policy(settings))
+    saved = walk_learning.as_learned(settings, walk_learning.first_policy(settings))
     saved.save(tmp_path / "p.npz")
     assert robot_of(load_walking_policy(tmp_path / "p.npz")) is NAO_H25
     # Files from before there was a choice are the NAO's.
@@ -284,7 +291,7 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
 )
 def test_a_policy_of_another_robot_is_refused(bench, capsys, command):
     settings = walk.SETTINGS["quick"]
-    walk.as_learned(settings, walk.first_policy(settings)).save(Path("p.npz"))
+    walk_learning.as_learned(settings, walk_learning.first_policy(settings)).save(Path("p.npz"))
     assert tools([*command, "--policy", "p.npz", "--robot", "nao_h25"]) == 2
     assert capsys.readouterr().err == "error: p.npz is a policy of the robot nao, not of nao_h25\n"
     assert not Path("w.csv").exists() and not bench
@@ -294,7 +301,7 @@ def test_each_robot_has_its_latest_run(bench):
     shipped = play.default_policy("nao_h25")
     assert shipped == shipped_policy("nao_h25") != play.default_policy()
     settings = dataclasses.replace(walk.SETTINGS["quick"], robot="nao_h25")
-    folder = runner.run(runner.Request("walk", settings), console=None, say=lambda _: None)
+    folder = runner.run(request.Request("walk", settings), console=None, say=lambda _: None)
     assert play.default_policy("nao_h25") == folder / "policy.npz"
     assert play.default_policy() == play.default_policy("nao") == SHIPPED
     kept = results.load_manifest(folder)["settings"]
@@ -303,7 +310,7 @@ def test_each_robot_has_its_latest_run(bench):
     # The paper says nothing about it.
     assert not (folder / "claims.md").exists() and "paper" not in (folder / "table.md").read_text()
     said = []
-    assert runner.check(("walk",), say=said.append)
+    assert claims.check(("walk",), say=said.append)
     assert said[0].startswith("walk: no results yet")
 
 
@@ -323,21 +330,23 @@ def test_unknown_names_are_refused(name, known):
         walk.Settings(**{name: "moon"})
 
 
-@pytest.mark.parametrize("name", walk.PHYSICS)
+@pytest.mark.parametrize("name", PHYSICS)
 def test_physics_is_what_is_asked_for(monkeypatch, name):
     asked = {}
     monkeypatch.setattr(
-        walk, "nao_walk", lambda *bounds, **settings: asked.update(settings) or stand_in(*bounds, **settings)
+        walk_learning,
+        "nao_walk",
+        lambda *bounds, **settings: asked.update(settings) or stand_in(*bounds, **settings),
     )
-    walk.make_task(walk.Settings(physics=name))
-    assert asked["physics"] is walk.PHYSICS[name]
+    walk_learning.make_task(walk.Settings(physics=name))
+    assert asked["physics"] is PHYSICS[name]
 
 
 @pytest.mark.parametrize(("platform", "name"), [("cpu", "c"), ("gpu", "mjx")])
 def test_the_faster_physics_of_the_machine_are_chosen(monkeypatch, platform, name):
     monkeypatch.setattr(jax, "default_backend", lambda: platform)
-    monkeypatch.setitem(walk.PHYSICS, name, lambda model, num_substeps: (model, num_substeps))
-    assert walk.PHYSICS["auto"]("model", 5) == ("model", 5)
+    monkeypatch.setitem(PHYSICS, name, lambda model, num_substeps: (model, num_substeps))
+    assert PHYSICS["auto"]("model", 5) == ("model", 5)
     assert walk.Settings().resolved().physics == name
 
 
@@ -368,12 +377,12 @@ def test_resume_finds_the_latest_unfinished_run_of_the_robot(bench):
     others = unfinished("1", settings["nao_h25"])
     ours = unfinished("2", settings["nao"])
     for robot, folder in ((None, ours), ("nao", ours), ("nao_h25", others)):
-        found = runner.folder_to_resume("walk", None, robot)
+        found = request.folder_to_resume("walk", None, robot)
         assert found == folder
-        assert runner.default_settings(walk, "walk", out=found, resume=True).robot == (robot or "nao")
+        assert request.default_settings(walk, "walk", out=found, resume=True).robot == (robot or "nao")
     shutil.rmtree(others)
     with pytest.raises(UserError, match="no unfinished run of walk with the robot nao_h25 in results"):
-        runner.folder_to_resume("walk", None, "nao_h25")
+        request.folder_to_resume("walk", None, "nao_h25")
 
 
 @pytest.mark.parametrize("physics", ["mjx", "auto"])
@@ -382,10 +391,10 @@ def test_a_run_from_before_robots_can_be_resumed(bench, physics):
     settings = dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"].resolved(), physics=physics))
     del settings["robot"], settings["start_policy"]
     unfinished("1", settings)
-    begin = runner.default_settings(walk, "walk", resume=True)
-    resumed, _, manifest = runner._resumed(walk, runner.Request("walk", begin, resume=True))
+    begin = request.default_settings(walk, "walk", resume=True)
+    resumed, _, manifest = request.resumed(walk, request.Request("walk", begin, resume=True))
     del settings["iterations"]
-    identity = runner._identity("walk", resumed, manifest["seed"])
+    identity = request.identity("walk", resumed, manifest["seed"])
     assert (identity["experiment"], identity["settings"]) == ("walk", settings)
     assert resumed.physics == physics and resumed.robot == "nao"
 

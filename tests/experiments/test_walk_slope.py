@@ -16,7 +16,8 @@ from creps_jax.tasks.walking import WalkOutcome, WalkRecord
 from creps_jax.tools import play
 from creps_jax.tools.video import Clip
 from creps_jax.walking.params import PARAM_NAMES
-from experiments import runner, walk, walk_slope
+from experiments import request, runner, walk, walk_slope
+from experiments.walking import learning as walk_learning
 
 STEEPEST = 9.0
 
@@ -42,7 +43,7 @@ def settings(tmp_path, monkeypatch):
     small = {"iterations": 2, "trials": 2, "eval_seeds": 3, "first_samples": 30, "samples": 30}
     settings = dataclasses.replace(walk_slope.SETTINGS["quick"], **small)
     clips = [Clip("caption", np.zeros((5, 29)), 0.02)]
-    monkeypatch.setattr(walk, "nao_walk", stand_in)
+    monkeypatch.setattr(walk_learning, "nao_walk", stand_in)
     monkeypatch.setattr(walk_slope, "record", lambda policy, speeds, **_: clips)
     monkeypatch.setattr(walk_slope, "save_film", lambda clips, path, say, robot: say(f"video: {path}"))
     monkeypatch.setattr(walk_slope, "SETTINGS", {"quick": settings})
@@ -54,7 +55,7 @@ def settings(tmp_path, monkeypatch):
 def test_the_result_folder_is_complete(settings):
     said = []
     folder = runner.run(
-        runner.Request("walk_slope", walk_slope.SETTINGS["quick"]), console=None, say=said.append
+        request.Request("walk_slope", walk_slope.SETTINGS["quick"]), console=None, say=said.append
     )
     names = "arrays.npz manifest.json checkpoint-walk_slope.npz claims.md policy.npz table.md"
     figures = "learning_curve.png updates.png falls.png speed.png parameters.png"
@@ -83,14 +84,14 @@ def test_the_result_folder_is_complete(settings):
 
 
 def test_contexts_are_drawn_a_little_beyond_both_ranges(settings):
-    sample = walk.make_task(settings).sample_context
+    sample = walk_learning.make_task(settings).sample_context
     contexts = np.asarray(jax.vmap(sample)(jax.random.split(jax.random.key(0), 2000)))
     np.testing.assert_allclose(contexts.min(axis=0), [0.08, -11.0], atol=0.05)
     np.testing.assert_allclose(contexts.max(axis=0), [0.42, 11.0], atol=0.05)
 
 
 def test_learning_begins_with_the_shipped_walk_on_every_slope(settings):
-    start = walk.as_learned(settings, walk_slope.warm_start(settings))
+    start = walk_learning.as_learned(settings, walk_slope.warm_start(settings))
     shipped = load(policies_folder() / "walk.npz")
     width = np.subtract(shipped.parameters.high, shipped.parameters.low)
     for speed in (0.1, 0.22, 0.4):
@@ -114,7 +115,7 @@ def test_films_show_each_walk_on_its_slope(settings, monkeypatch):
         qpos = jnp.zeros((len(time), 29)).at[:, 0].set(0.1 * values[0] * time)
         return WalkRecord(time, qpos, qpos, qpos, jnp.zeros(len(time), bool))
 
-    policy = walk.as_learned(settings, walk.first_policy(settings))
+    policy = walk_learning.as_learned(settings, walk_learning.first_policy(settings))
     monkeypatch.setattr(play, "record_walk", recorded)
     clips = play.record(policy, (0.2, 0.3), seed=0, slopes=(2.0, -4.0))
     assert [clip.slope for clip in clips] == [2.0, -4.0]
