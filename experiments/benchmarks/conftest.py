@@ -1,8 +1,5 @@
-"""Set the process up as the command line does, but without the cache of compiled programs."""
+"""Compile anew: the cache of compiled programs would hide the time that it takes."""
 
-import os
+import jax
 
-from creps_jax.tools.process import prepare
-
-os.environ["JAX_COMPILATION_CACHE_DIR"] = ""
-prepare()
+jax.config.update("jax_enable_compilation_cache", False)

@@ -1,40 +1,38 @@
-"""Measure what a search does without evidence, and with rare evidence.
+"""Measure searches without evidence, and with rare evidence.
 
     python -m experiments.benchmarks.evidence [--trials 8] [--searches 40]
     python -m experiments.benchmarks.evidence --trade-off FILE.png
 
-Pure noise: rewards that have nothing to do with the parameters, 2 contexts, affine features. The spread of
-the policy should stay; it is printed as the logarithm of what is left of it, for several lengths of the
-archive, with and without the test on evidence. Sparse: a reward of 1 for hits, which the first policy has by
-chance in 0.4 % of its episodes, and 0 otherwise. Trade-off: what the evidence that is asked for
-(`significance`) costs on test functions and saves in noise, as a figure.
+Pure noise: rewards that do not depend on the parameters, 2 contexts, affine features. The spread of the
+policy should not change; the logarithm of its last value over its first is printed, for several sizes of the
+archive, with and without the test on evidence. Sparse: a reward of 1 for hits, in 0.4 % of the episodes of
+the first policy, and 0 otherwise. Trade-off: the effect of `significance` in noise and on test functions, as
+a figure.
 """
 
-from creps_jax.tools.process import prepare
+import sys
+from pathlib import Path
 
-prepare()
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
 
-from pathlib import Path  # noqa: E402
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-import tyro  # noqa: E402
-
-from creps_jax.contexts import context_grid, uniform_contexts  # noqa: E402
-from creps_jax.policies.features import linear_features  # noqa: E402
-from creps_jax.policies.gaussian import LinearGaussian  # noqa: E402
-from creps_jax.search.creps import Creps, creps  # noqa: E402
-from creps_jax.search.fit import bounded_ml, weighted_ml  # noqa: E402
-from creps_jax.tasks import PlainOutcome, Task  # noqa: E402
-from creps_jax.tools import plots, tables  # noqa: E402
-from creps_jax.training import train_trials  # noqa: E402
-from experiments import comparison, updates  # noqa: E402
-from experiments.comparison import LearnerSettings, compare, mean_policy_curve  # noqa: E402
+from creps_jax.contexts import context_grid, uniform_contexts
+from creps_jax.policies.features import linear_features
+from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.search.creps import Creps, creps
+from creps_jax.search.fit import bounded_ml, weighted_ml
+from creps_jax.tasks import PlainOutcome, Task
+from creps_jax.tools import plots, tables
+from creps_jax.tools.command_line import answer
+from creps_jax.training import train_trials
+from experiments import comparison, updates
+from experiments.comparison import LearnerSettings, compare, mean_policy_curve
 
 M_STEPS = {"weighted ML": weighted_ml, "bounded": bounded_ml()}
 NOISE = ((10, 20, 3_000, (60, 100, 200)), (20, 50, 10_000, (200,)))
-"""Parameters, samples of an iteration, episodes, and lengths of the archive."""
+"""Parameters, samples of an iteration, episodes, and sizes of the archive."""
 SIGNIFICANCES = {"default": 0.1, "no test": None}
 SPARSE_ARCHIVE, SPARSE_SAMPLES, SPARSE_EPISODES = 200, 20, 3_000
 HIT_RADIUS = 0.17
@@ -46,14 +44,14 @@ def main(trials: int = 8, searches: int = 40, trade_off: Path | None = None) -> 
     """Measure, and print a table for each.
 
     Args:
-        trials: Searches in pure noise, for each row.
+        trials: Searches of each row in pure noise.
         searches: Searches for the sparse reward.
-        trade_off: Measure and draw what `significance` costs and saves instead, into this file.
+        trade_off: Draw the effect of `significance` into this file, and measure nothing else.
     """
     if trade_off is not None:
         draw_trade_off(measure_trade_off(), trade_off)
         return
-    print("Pure noise: log(spread after / before), mean of the parameters; mean (least) of the trials")
+    print("Pure noise: log(spread after / before), mean of the parameters; mean (lowest) of the trials")
     for fit in M_STEPS:
         for dim, samples, episodes, archives in NOISE:
             for archive in archives:
@@ -69,7 +67,7 @@ def main(trials: int = 8, searches: int = 40, trade_off: Path | None = None) -> 
 
 
 def measure_trade_off(trials: int = 20) -> dict[str, np.ndarray]:
-    """Return, for each of `LEVELS`, rows of trials: what noise leaves of the spread, and last rewards."""
+    """Return, for each of `LEVELS`, rows of trials: the last spread in noise, and the last rewards."""
     rows: dict[str, list[np.ndarray]] = {}
     plan = LearnerSettings(iterations=200, trials=trials, samples=50)
     setup_key, learn_key = jax.random.split(jax.random.key(0))
@@ -90,23 +88,20 @@ def measure_trade_off(trials: int = 20) -> dict[str, np.ndarray]:
 
 def draw_trade_off(rows: dict[str, np.ndarray], path: Path) -> None:
     """Draw medians and quartiles over `LEVELS`."""
-    figure, axes = plots.new_figure(2, 4, width=11.0, height=5.0)
-    panels = axes.flat
-    for panel, (name, row) in zip(panels, rows.items(), strict=False):
+    figure, _, panels = plots.new_panels(len(rows), 4, width=2.75, height=2.5, margin=0.0)
+    for panel, (name, row) in zip(panels, rows.items(), strict=True):
         low, middle, high = np.percentile(row, (25, 50, 75), axis=1)
         panel.errorbar(range(len(LEVELS)), middle, (middle - low, high - middle), marker="o", capsize=3)
         panel.set(title=name, xlabel="significance")
         panel.set_xticks(range(len(LEVELS)), ["none" if x is None else f"{x:g}" for x in LEVELS])
-        panel.set_ylabel("log of the spread that is left" if name.startswith("pure noise") else "mean reward")
-    for panel in panels[len(rows) :]:
-        panel.set_axis_off()
+        panel.set_ylabel("log(spread after / before)" if name.startswith("pure noise") else "mean reward")
     plots.save_figure(path, figure)
 
 
 def log_spread(
     fit: str, dim: int, samples: int, episodes: int, archive: int, trials: int, significance: float | None
 ) -> np.ndarray:
-    """Return the logarithm of the geometric mean spread that noise leaves of one, for each trial."""
+    """Return the logarithm of the geometric mean of the last spread, for each trial; the first one is 1."""
 
     def rollout(key: jax.Array, context: jax.Array, theta: jax.Array) -> PlainOutcome:
         return PlainOutcome(jax.random.normal(key), jnp.zeros(0))
@@ -150,4 +145,4 @@ def _last_policies(algorithm: Creps, task: Task, samples: int, episodes: int, tr
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    sys.exit(answer(lambda: tyro.cli(main)))

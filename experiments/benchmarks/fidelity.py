@@ -1,29 +1,24 @@
-"""Walk with a policy by MJX and in a finer physics, side by side.
+"""Compare the walks of a policy in MJX and in a finer simulation.
 
     python -m experiments.benchmarks.fidelity [POLICY.npz] [--robot NAME]
 
-The finer one is C MuJoCo with a fifth of the time step and a solver that runs until it has converged. The
-seeds of the noise are used nowhere else. Without a file it is the shipped policy of the robot.
+The finer simulation is C MuJoCo with a fifth of the time step and a solver that runs until it converges. No
+other command uses these seeds of the noise. Without a file the policy is the shipped one of the robot.
 """
 
-from creps_jax.tools.process import import_mjx_quietly, prepare
+import sys
+from pathlib import Path
 
-prepare()
-import_mjx_quietly()
+import numpy as np
+import tyro
 
-import sys  # noqa: E402
-from pathlib import Path  # noqa: E402
-
-import numpy as np  # noqa: E402
-import tyro  # noqa: E402
-
-from creps_jax.errors import UserError  # noqa: E402
-from creps_jax.simulation import c  # noqa: E402
-from creps_jax.simulation.models import load_nao  # noqa: E402
-from creps_jax.tasks.walking import nao_walk  # noqa: E402
-from creps_jax.tools import tables  # noqa: E402
-from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy  # noqa: E402
-from experiments.benchmarks.policy import speeds_of, walk_at_all_speeds  # noqa: E402
+from creps_jax.simulation import c
+from creps_jax.simulation.models import load_nao
+from creps_jax.tasks.walking import nao_walk
+from creps_jax.tools import tables
+from creps_jax.tools.command_line import answer
+from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy
+from experiments.benchmarks.policy import speeds_of, walk_at_all_speeds
 
 SEED = 90_000
 FINER = 5
@@ -35,7 +30,7 @@ def main(policy: tyro.conf.Positional[Path | None] = None, robot: str | None = N
 
     Args:
         policy: Policy file; the shipped one by default.
-        robot: Whose policy; nao by default, or the one of the file.
+        robot: Robot of the policy; by default the robot of the file, or nao.
     """
     saved = load_walking_policy(policy or shipped_policy(robot), robot)
     walker = robot_of(saved)
@@ -61,7 +56,4 @@ def main(policy: tyro.conf.Positional[Path | None] = None, robot: str | None = N
 
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(main)
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    sys.exit(answer(lambda: tyro.cli(main)))

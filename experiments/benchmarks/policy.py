@@ -1,34 +1,29 @@
-"""Evaluate a walking policy at 11 speeds, 50 fresh episodes each; the NAO's beside the paper's Table 2.
+"""Evaluate a walking policy at 11 speeds, with 50 new episodes each, and compare it with the paper's Table 2.
 
     python -m experiments.benchmarks.policy [POLICY.npz] [--robot NAME] [--noise TIMES]
                                             [--placement-gain GAIN] [--seed SEED]
 
-Without a file it is the shipped policy of the robot. The last options show what more noise, or steps that
-answer to a sideways tilt otherwise than those that the policy was learned with, do to it.
+Without a file the policy is the shipped one of the robot. The last options test a policy in more noise, or
+with another gain of the foot placement than it was learned with.
 """
 
-from creps_jax.tools.process import import_mjx_quietly, prepare
+import sys
+from pathlib import Path
+from typing import Any
 
-prepare()
-import_mjx_quietly()
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
 
-import sys  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import numpy as np  # noqa: E402
-import tyro  # noqa: E402
-
-from creps_jax.errors import UserError  # noqa: E402
-from creps_jax.policies.learned import Learned  # noqa: E402
-from creps_jax.tasks import Task  # noqa: E402
-from creps_jax.tasks.walking import WalkNoise, nao_walk  # noqa: E402
-from creps_jax.tools import tables  # noqa: E402
-from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy  # noqa: E402
-from creps_jax.training import evaluate  # noqa: E402
-from experiments.walk import NUM_SPEEDS  # noqa: E402
+from creps_jax.policies.learned import Learned
+from creps_jax.tasks import Task
+from creps_jax.tasks.walking import WalkNoise, nao_walk
+from creps_jax.tools import tables
+from creps_jax.tools.command_line import answer
+from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy
+from creps_jax.training import evaluate
+from experiments.walking.settings import NUM_SPEEDS
 
 SEEDS = 50
 
@@ -44,9 +39,9 @@ def main(
 
     Args:
         policy: Policy file; the shipped one by default.
-        robot: Whose policy; nao by default, or the one of the file.
-        noise: How many times the usual noise.
-        placement_gain: In place of the one that the policy was learned with.
+        robot: Robot of the policy; by default the robot of the file, or nao.
+        noise: Factor of the usual noise.
+        placement_gain: Gain of the foot placement; by default the one that the policy was learned with.
         seed: Seed of the noise.
     """
     saved = load_walking_policy(policy or shipped_policy(robot), robot)
@@ -62,12 +57,12 @@ def main(
 
 
 def speeds_of(saved: Learned) -> np.ndarray:
-    """Return 11 speeds over the range of a policy, m/s: for the NAO the paper's."""
+    """Return 11 speeds over the range of a policy, m/s; for the NAO the paper's."""
     return np.linspace(saved.contexts.low[0], saved.contexts.high[0], NUM_SPEEDS, dtype=np.float32)
 
 
 def walk_at_all_speeds(saved: Learned, task: Task, *, seed: int) -> Any:
-    """Roll out a policy at 11 speeds with fresh noise; the outcome has axes (speeds, seeds)."""
+    """Roll out a policy at 11 speeds; the outcome has axes (speeds, seeds)."""
     speeds = speeds_of(saved)
     thetas = jnp.stack([jnp.asarray(saved.theta(float(speed))) for speed in speeds])
     outcome = evaluate(jax.random.key(seed), task, jnp.asarray(speeds)[:, None], thetas, repeats=SEEDS)
@@ -75,7 +70,4 @@ def walk_at_all_speeds(saved: Learned, task: Task, *, seed: int) -> Any:
 
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(main)
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    sys.exit(answer(lambda: tyro.cli(main)))

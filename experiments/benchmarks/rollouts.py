@@ -2,38 +2,34 @@
 
     python -m experiments.benchmarks.rollouts
 
-Each round runs all in turn; the ratios are medians over the rounds. Ours have the controller in the loop; C
-MuJoCo replays what it told the servos in as many such walks, noise and all (without noise the solver has less
-to do), with `mujoco.rollout`, one thread a core, whole walks at once. It does so with the model as it is, and
-without what ours leaves out by C: the sensors, and islands, of which one robot is one. What C gains from all
-threads over one tells how far this machine scales at all: cores that share a chip with others slow down when
-all are busy. As many walk at once as in an iteration of the preset `quick`.
+Each round runs all contestants in turn; the ratios are medians over the rounds. Our rollouts have the
+controller in the loop. Bare C MuJoCo replays the recorded set-points of the servos of as many walks, with
+their noise (without noise the solver has less work), by `mujoco.rollout` with one thread for each core. "no
+extras" is without sensors and islands, which our physics by C does not compute either. The ratio of all
+threads to one thread shows how the machine itself scales: cores of one chip slow down when all are busy. The
+batch has the size of an iteration of the preset `quick`.
 """
 
-from creps_jax.tools.process import import_mjx_quietly, prepare, usable_cores
+import functools
+import time
+from collections.abc import Callable
 
-prepare()
-import_mjx_quietly()
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jax.experimental import io_callback
 
-import functools  # noqa: E402
-import time  # noqa: E402
-from collections.abc import Callable  # noqa: E402
-
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
-import mujoco  # noqa: E402
-import mujoco.rollout  # noqa: E402
-import numpy as np  # noqa: E402
-from jax.experimental import io_callback  # noqa: E402
-
-from creps_jax.simulation import c, mjx  # noqa: E402
-from creps_jax.simulation.models import load_nao  # noqa: E402
-from creps_jax.simulation.servos import read_servos  # noqa: E402
-from creps_jax.simulation.state import ControlStep, substep_shares  # noqa: E402
-from creps_jax.tasks import Task  # noqa: E402
-from creps_jax.tasks.walking import CONTROL_PERIOD, Physics, nao_walk, record_walk  # noqa: E402
-from creps_jax.training import evaluate  # noqa: E402
-from experiments.walk import SETTINGS  # noqa: E402
+from creps_jax.simulation import c, mjx
+from creps_jax.simulation.models import load_nao
+from creps_jax.simulation.servos import read_servos
+from creps_jax.simulation.state import ControlStep, substep_shares
+from creps_jax.tasks import Task
+from creps_jax.tasks.walking import CONTROL_PERIOD, nao_walk, record_walk
+from creps_jax.tools.process import usable_cores
+from creps_jax.training import evaluate
+from experiments.walking.settings import SETTINGS
 
 _QUICK = SETTINGS["quick"]
 BATCH = _QUICK.trials * _QUICK.samples * _QUICK.repeats
@@ -96,11 +92,11 @@ def _ours(devices: list[jax.Device], physics: Physics = mjx.make_control_step) -
 
 
 def _bare_c(model: mujoco.MjModel, threads: int) -> Callable[[], None]:
-    start, told = _told()
+    start, inputs = _recorded()
     data = [mujoco.MjData(model) for _ in range(threads)]
     states = np.concatenate([np.zeros((BATCH, 1)), start, np.zeros((BATCH, model.nv))], axis=1)
     shares = substep_shares(round(CONTROL_PERIOD / model.opt.timestep))
-    before, after, speed = np.split(told, 3, axis=-1)
+    before, after, speed = np.split(inputs, 3, axis=-1)
     controls = read_servos(model).controls(shares, before, after, speed).reshape(BATCH, -1, model.nu)
 
     def run() -> None:
@@ -110,34 +106,34 @@ def _bare_c(model: mujoco.MjModel, threads: int) -> Callable[[], None]:
 
 
 @functools.cache
-def _told() -> tuple[np.ndarray, np.ndarray]:
-    """Walk, and note where each robot starts (BATCH, nq) and what servos are told (BATCH, ticks, 3 nu)."""
-    noted = []
+def _recorded() -> tuple[np.ndarray, np.ndarray]:
+    """Walk, and record first positions (BATCH, nq) and inputs of the servos (BATCH, ticks, 3 nu)."""
+    rows_seen = []
 
-    def noting(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
+    def recording(model: mujoco.MjModel, num_substeps: int) -> ControlStep:
         step = c.make_control_step(model, num_substeps)
 
         def control_step(robot, before, after, speed):
             row = jnp.concatenate([robot.qpos, before, after, speed])
-            io_callback(lambda row: noted.append(np.array(row)), None, row, ordered=True)
+            io_callback(lambda row: rows_seen.append(np.array(row)), None, row, ordered=True)
             return step(robot, before, after, speed)
 
         return control_step
 
     def walk(key: jax.Array) -> jax.Array:
         theta = jnp.array(THETA)
-        return record_walk(key, theta, duration=DURATION, balance=BALANCE, physics=noting).has_fallen.any()
+        return record_walk(key, theta, duration=DURATION, balance=BALANCE, physics=recording).has_fallen.any()
 
-    # One robot after the other: what is noted is in order. One device, as ordered callbacks want it.
+    # One robot after the other, so that rows are recorded in order; ordered callbacks need one device.
     with jax.default_device(jax.devices()[0]):
         keys = jax.random.split(jax.random.key(0), BATCH)
         fell = jax.jit(lambda keys: jax.lax.map(walk, keys))(keys)
         jax.effects_barrier()
     if fell.any():
         raise RuntimeError(f"robots of the benchmark must not fall, but {int(fell.sum())} of {BATCH} did")
-    rows = np.stack(noted).reshape(BATCH, round(DURATION / CONTROL_PERIOD), -1)
-    qpos, told = np.split(rows, [load_nao().nq], axis=-1)
-    return qpos[:, 0], told
+    rows = np.stack(rows_seen).reshape(BATCH, round(DURATION / CONTROL_PERIOD), -1)
+    qpos, inputs = np.split(rows, [load_nao().nq], axis=-1)
+    return qpos[:, 0], inputs
 
 
 if __name__ == "__main__":

@@ -1,51 +1,48 @@
-"""Measure how walking rollouts scale: their speed and memory by batch size, physics and number of devices.
+"""Measure speed and memory of walking rollouts by batch size, physics and number of devices.
 
     python -m experiments.benchmarks.scaling [--sizes 32 128] [--physics mjx c] [--devices 1 2]
 
-Each row is measured in a process of its own, which compiles anew, so that its peak of memory is its own. One
-device of several has its share of the cores for C MuJoCo, too. The time without physics is that of the same
-rollouts where the robot is not stepped: planning, controller and noise.
+Each row is measured in a new process, without the cache of compiled programs, so that its peak of memory
+belongs to this row. With C MuJoCo, too, one of several devices has its share of the cores. "without physics"
+is the time of the same rollouts without simulation steps: planning, controller and noise.
 """
 
-from creps_jax.tools.process import import_mjx_quietly, prepare, usable_cores
+import itertools
+import multiprocessing
+import re
+import resource
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
 
-prepare()
-import_mjx_quietly()
+import jax
+import numpy as np
+import tyro
 
-import itertools  # noqa: E402
-import multiprocessing  # noqa: E402
-import re  # noqa: E402
-import resource  # noqa: E402
-import sys  # noqa: E402
-import time  # noqa: E402
-from collections.abc import Callable, Mapping, Sequence  # noqa: E402
-from concurrent.futures import ProcessPoolExecutor  # noqa: E402
-from concurrent.futures.process import BrokenProcessPool  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any, NamedTuple, TypeVar  # noqa: E402
-
-import jax  # noqa: E402
-import numpy as np  # noqa: E402
-import tyro  # noqa: E402
-
-from creps_jax.errors import UserError  # noqa: E402
-from creps_jax.rollouts import roll_out  # noqa: E402
-from creps_jax.simulation.state import ControlStep, RobotState  # noqa: E402
-from creps_jax.tasks.walking import CONTROL_PERIOD, Physics  # noqa: E402
-from creps_jax.tools import tables  # noqa: E402
-from experiments.benchmarks.rollouts import walking_batch  # noqa: E402
-from experiments.walk import PHYSICS, TIMESTEP  # noqa: E402
+from creps_jax.errors import UserError
+from creps_jax.rollouts import roll_out
+from creps_jax.simulation.state import ControlStep, RobotState
+from creps_jax.tasks.walking import CONTROL_PERIOD, Physics
+from creps_jax.tools import tables
+from creps_jax.tools.command_line import answer
+from creps_jax.tools.process import usable_cores
+from experiments.benchmarks.rollouts import walking_batch
+from experiments.walking.settings import PHYSICS, TIMESTEP
 
 SIZES = (32, 128, 512, 2048, 4096)
 ROUNDS = 5
 LONGEST = 10.0
-"""Seconds after which no further round begins."""
+"""Seconds after which no more rounds start."""
 
 T = TypeVar("T")
 
 
 class Case(NamedTuple):
-    """What a row of the table is about: duration of an episode in s, and the first so many devices."""
+    """A row of the table: physics, number of devices, batch size, and duration of an episode in s."""
 
     physics: str
     devices: int
@@ -54,16 +51,16 @@ class Case(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What came of it: seconds, and MiB.
+    """The measurements of a case: seconds, and MiB.
 
     Attributes:
         compiling: time to compile.
         running: time of all episodes, the median of the rounds.
-        without_physics: the same where the robot is not stepped.
-        compiled_memory: largest memory of the process up to its first rollout.
-        peak_memory: largest memory of the process.
-        buffers: what the compiled program keeps on all its devices together.
-        device_memory: largest memory in use on a device; None where it does not tell, such as a CPU.
+        without_physics: the same without simulation steps.
+        compiled_memory: peak memory of the process before its first rollout.
+        peak_memory: peak memory of the process.
+        buffers: memory of the compiled program on all its devices.
+        device_memory: peak memory of a device; None if it does not report it, such as a CPU.
     """
 
     compiling: float
@@ -85,8 +82,8 @@ def main(
 
     Args:
         sizes: Episodes in a batch.
-        physics: What steps the robot, mjx or c.
-        devices: How many of the devices share a batch; one and all by default.
+        physics: Simulation of the robot, mjx or c.
+        devices: Numbers of devices that share a batch; one and all by default.
         duration: Length of an episode, s.
     """
     platform, num_devices = in_new_process(describe_devices)
@@ -99,12 +96,12 @@ def main(
     try:
         for name, num in itertools.product(physics, devices):
             measure_sizes(rows, [Case(name, num, size, duration) for size in sorted(sizes)])
-    finally:  # an interrupt leaves what has been measured by then
+    finally:  # an interrupt prints the rows that are measured
         print(f"\n{tables.to_markdown(columns(rows))}")
 
 
 def measure_sizes(rows: dict[Case, Measured | str], cases: Sequence[Case]) -> None:
-    """Measure cases of growing size, each in a new process, until one does not fit."""
+    """Measure cases of growing size, each in a new process, until the memory is too small."""
     for case in cases:
         print(f"{case.physics}, devices {case.devices}, batch {case.size} ...", file=sys.stderr, flush=True)
         try:
@@ -118,10 +115,10 @@ def measure_sizes(rows: dict[Case, Measured | str], cases: Sequence[Case]) -> No
 def check(
     sizes: Sequence[int], physics: Sequence[str], devices: Sequence[int], duration: float, num_devices: int
 ) -> None:
-    """Refuse what cannot be measured.
+    """Check the cases.
 
     Raises:
-        UserError: if that is asked for.
+        UserError: for a case that cannot be measured.
     """
     for name in physics:
         if name not in PHYSICS:
@@ -135,10 +132,10 @@ def check(
 
 
 def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
-    """Call a function in a process of its own.
+    """Call a function in a new process.
 
     Raises:
-        BrokenProcessPool: if that does not live to answer.
+        BrokenProcessPool: if the process is killed.
     """
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
@@ -146,12 +143,12 @@ def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
 
 
 def describe_devices() -> tuple[str, int]:
-    """Return what kind of devices there are, and how many."""
+    """Return the kind and the number of the devices."""
     return jax.devices()[0].device_kind, jax.device_count()
 
 
 def measure(case: Case) -> Measured | str:
-    """Compile and run a case; return "out of memory" if a device has not enough."""
+    """Compile and run a case; return "out of memory" if the memory of a device is too small."""
     jax.config.update("jax_enable_compilation_cache", False)
     try:
         return _measure(case)
@@ -168,8 +165,8 @@ def _measure(case: Case) -> Measured:
     running, largest = _median_seconds(run), peak_memory()
     sizes = compiled.memory_analysis()
     buffers = sizes.temp_size_in_bytes + sizes.argument_size_in_bytes + sizes.output_size_in_bytes
-    told = jax.devices()[0].memory_stats() or {}
-    device_memory = told.get("peak_bytes_in_use")
+    stats = jax.devices()[0].memory_stats() or {}
+    device_memory = stats.get("peak_bytes_in_use")
     _, run_without = _compile(case, _no_physics)
     return Measured(
         compiling=compiling,
@@ -183,7 +180,7 @@ def _measure(case: Case) -> Measured:
 
 
 def _compile(case: Case, physics: Physics) -> tuple[Any, Callable[[], Any]]:
-    """Compile the rollouts of a case; return the program, and what runs it to its end."""
+    """Compile the rollouts of a case; return the program, and a function that runs it."""
     task, contexts, thetas = walking_batch(case.size, case.duration, physics)
     devices = tuple(jax.devices()[: case.devices])
     batch = (jax.random.key(0), contexts, thetas)
@@ -193,11 +190,11 @@ def _compile(case: Case, physics: Physics) -> tuple[Any, Callable[[], Any]]:
 
 
 def _no_physics(*_: Any) -> ControlStep:
-    """Return a control step that leaves the robot where it is, all but: XLA plans only what is of use."""
+    """Return a control step that hardly moves the robot; it uses all inputs, so that XLA computes them."""
 
     def control_step(state: RobotState, before: jax.Array, after: jax.Array, speed: jax.Array) -> RobotState:
-        told = 1e-9 * (before + after + speed).sum()
-        return state._replace(qpos=state.qpos.at[0].add(told))
+        change = 1e-9 * (before + after + speed).sum()
+        return state._replace(qpos=state.qpos.at[0].add(change))
 
     return control_step
 
@@ -212,9 +209,9 @@ def _median_seconds(run: Callable[[], Any]) -> float:
 
 
 def peak_memory() -> float:
-    """Return the largest memory that this process has had so far, MiB."""
+    """Return the peak memory of this process so far, MiB."""
     status = Path("/proc/self/status")
-    # What getrusage tells may be, on Linux, that of the process that started this one.
+    # On Linux, getrusage may report the memory of the parent process.
     if status.exists() and (found := re.search(r"VmHWM:\s*(\d+) kB", status.read_text())):
         return int(found[1]) / 2**10
     unit = 1 if sys.platform == "darwin" else 2**10
@@ -222,7 +219,7 @@ def peak_memory() -> float:
 
 
 def columns(rows: Mapping[Case, Measured | str]) -> dict[str, list[str]]:
-    """Return the table's columns; a case that could not be measured says why in place of its speed."""
+    """Return the columns of the table; the speed of a case that was not measured is the reason."""
     done = {case: measured for case, measured in rows.items() if not isinstance(measured, str)}
     table: dict[str, list[str]] = {}
 
@@ -253,7 +250,4 @@ def columns(rows: Mapping[Case, Measured | str]) -> dict[str, list[str]]:
 
 
 if __name__ == "__main__":
-    try:
-        tyro.cli(main)
-    except UserError as error:
-        sys.exit(f"error: {error}")
+    sys.exit(answer(lambda: tyro.cli(main)))
