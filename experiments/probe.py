@@ -1,4 +1,4 @@
-"""Walk by C MuJoCo and measure inside: contact, torques, soles, joints, at every physics step."""
+"""Measure contact, torques, soles and joints of a walk by C MuJoCo, at every physics step."""
 
 from typing import NamedTuple
 
@@ -16,18 +16,18 @@ SOLES = ("left_sole", "right_sole")
 
 
 class Measured(NamedTuple):
-    """What is measured of a walk (leading axis n physics steps), in the world, m, s, rad and N m.
+    """Measurements of a walk (leading axis n physics steps), in the world frame, in m, s, rad and N m.
 
     Attributes:
         time: time since the first step.
         com: centre of mass.
-        zmp: centre of pressure of both soles together; NaN while none touches the floor.
-        soles: position of the left and the right sole, below the ankle.
-        sole_velocity: their velocity.
-        is_loaded: whether each carries weight.
+        zmp: centre of pressure of both soles together; NaN if none touches the floor.
+        soles: positions of the left and the right sole, below the ankle.
+        sole_velocity: velocities of the soles.
+        is_loaded: whether each sole carries weight.
         joint_pos: positions of the joints.
         set_point: set-points of their servos, with the noise.
-        torque_share: largest torque of a leg's servo, as a share of its limit.
+        torque_share: largest torque of a leg's servo, divided by its limit.
         quat: orientation of the torso, wxyz.
     """
 
@@ -44,26 +44,26 @@ class Measured(NamedTuple):
 
 
 class Probe:
-    """A physics for one robot, such as `record_walk` takes, that notes what it sees."""
+    """A physics for one robot that records measurements, for `record_walk`."""
 
     def __init__(self) -> None:
         self._rows: list[Measured] = []
 
     def take(self) -> Measured:
-        """Return all that has been seen since the last time."""
+        """Return the measurements since the last call."""
         jax.effects_barrier()
         rows, self._rows = self._rows, []
         measured = Measured(*(np.stack(column) for column in zip(*rows, strict=True)))
         return measured._replace(time=measured.time - measured.time[0])
 
     def make_control_step(self, model: mujoco.MjModel, num_substeps: int) -> ControlStep:
-        """Return a control step as `creps_jax.simulation.c` makes it, by single steps; not to be vmapped."""
+        """Return a control step like `creps_jax.simulation.c`, of single steps; it cannot be vmapped."""
         shares, servos = substep_shares(num_substeps), read_servos(model)
         data = mujoco.MjData(model)
 
         def step(qpos, qvel, warmstart, before, after, speed):
             data.qpos, data.qvel, data.qacc_warmstart = qpos, qvel, warmstart
-            # Plain arrays: jax must not wait for jax within a callback.
+            # NumPy arrays: jax must not be called in a callback.
             before, after, speed = (np.asarray(x) for x in (before, after, speed))
             ahead = servos.lead * speed
             for control in servos.controls(shares, before, after, speed):
@@ -80,7 +80,7 @@ class Probe:
 
 
 def _measure(model: mujoco.MjModel, data: mujoco.MjData, set_point: np.ndarray) -> Measured:
-    """Measure right after a step: positions are those after it, forces those during it."""
+    """Measure after a step: positions at its end, forces during it."""
     sites = [model.site(name) for name in SOLES]
     pressure, moment, loads = 0.0, np.zeros(2), np.zeros(len(SOLES))
     force = np.zeros(6)

@@ -1,3 +1,1 @@
-"""Use what was learned: play, export, train on a real robot. `creps-jax` is the command; it needs the extra
-`tools`.
-"""
+"""Play and export learned policies, learn on a real robot: the command `creps-jax`, of the extra `tools`."""

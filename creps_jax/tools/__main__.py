@@ -7,7 +7,7 @@ from creps_jax.tools.command_line import start
 
 def main() -> Never:
     """Run the command line of this process."""
-    # tyro and what else the extra `tools` brings may be missing.
+    # The packages of the extra `tools` may be missing.
     try:
         from creps_jax.tools.cli import main
     except ModuleNotFoundError as error:

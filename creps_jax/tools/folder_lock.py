@@ -14,21 +14,21 @@ _PAUSE = 0.05
 
 @contextlib.contextmanager
 def locked(folder: Path, *, wait: float) -> Iterator[None]:
-    """Keep other processes that ask for the lock out of a folder; a process that dies gives it back.
+    """Hold the lock of a folder; a killed process releases it.
 
     Args:
-        folder: a folder that is there.
-        wait: seconds to wait for others.
+        folder: an existing folder.
+        wait: seconds to wait for other processes.
 
     Raises:
-        UserError: if another process still has it then.
+        UserError: if another process still holds the lock after that time.
         OSError: if the folder cannot be locked.
     """
     lock = filelock.FileLock(folder / LOCK, timeout=wait)
     try:
         lock.acquire(poll_interval=_PAUSE)
     except filelock.Timeout:
-        raise UserError(f"{folder} is in use by another process, try again when it is done") from None
+        raise UserError(f"{folder} is in use by another process, try again when it has ended") from None
     except NotImplementedError as error:
         raise OSError(f"the file system of {folder} has no locks") from error
     try:

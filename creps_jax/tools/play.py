@@ -1,4 +1,4 @@
-"""Use a walking policy: record its walks, show one of them, film several side by side."""
+"""Record, show and film walks of a policy."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -38,19 +38,19 @@ def show(
     seed: int,
     say: Callable[[str], None],
 ) -> None:
-    """Show walks at several speeds: what they reach, of a single one its parameters, and a video.
+    """Show walks at several speeds: reached speeds, the parameters of a single walk, and a video.
 
     Args:
-        speeds: asked speeds, m/s; of none, six over the policy's range.
-        path: policy file; None is the latest learned one of the robot, or else the shipped one.
-        robot: who walks; None is the policy's robot, or without a policy the NAO.
+        speeds: asked speeds, m/s; if empty, six speeds over the range of the policy.
+        path: policy file; None is the latest learned policy of the robot, or else the shipped one.
+        robot: name of the robot; None is the robot of the file, or without a file the NAO.
         out: the video, an .mp4 file.
         seed: seed of the noise.
-        say: told one line at a time.
+        say: prints one line.
 
     Raises:
-        UserError: if there is no such policy, it is unreadable or of another robot, a speed is outside its
-            range or there are too many, or the video cannot be written.
+        UserError: if the policy does not exist, is unreadable or of another robot, if a speed is outside its
+            range or there are too many, or if the video cannot be written.
     """
     if out.suffix != ".mp4" or out.is_dir():
         raise UserError(f"a video must be an .mp4 file, got {out}")
@@ -89,14 +89,14 @@ def record(
     """Record a walk at each speed, captioned with asked and reached speed.
 
     Args:
-        policy: a policy of the speed, or of speed and slope.
+        policy: a policy of which the context is speed, or speed and slope.
         speeds: asked speeds, m/s.
         seed: seed of the noise.
         duration: length of the walks, s.
-        slopes: slope of each walk, deg, for a policy that takes it.
+        slopes: slope of each walk, deg, for a policy with a slope in its context.
 
     Raises:
-        UserError: if there is no speed, or a context is not one that the policy has learned.
+        UserError: if there is no speed, or a context is outside the range of the policy.
     """
     if not speeds:
         raise UserError("name at least one speed")
@@ -104,7 +104,7 @@ def record(
     thetas = jnp.stack(
         [jnp.asarray(policy.theta(speed, *way)) for speed, way in zip(speeds, ways, strict=True)]
     )
-    # For a few walks, compiling MJX would take longer than they do.
+    # MJX would take longer to compile than a few walks take in C MuJoCo.
     settings = {"duration": duration, "balance": balance_of(policy), "physics": c.make_control_step}
     settings["robot"] = robot_of(policy)
     if slopes is not None:
@@ -125,7 +125,7 @@ def record(
 
 
 def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None], *, robot: Robot) -> None:
-    """Write a video, or say why there is none: it is the one part of a result that a machine may lack."""
+    """Write a video, or print why it cannot be made: a result is complete without it."""
     try:
         middle = len(clips[0].qpos) * clips[0].period / 2
         write_video(path, model_path(robot), clips, still_at=middle)
@@ -135,13 +135,13 @@ def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None], *, 
 
 
 def default_policy(robot: str | None = None) -> Path:
-    """Return the policy of a robot's latest finished run, or else the one that comes with the project.
+    """Return the policy of a robot's latest finished run, or else its shipped policy.
 
     Args:
-        robot: the robot's name; None is the NAO.
+        robot: name of the robot; None is the NAO.
 
     Raises:
-        UserError: if there is neither, or no such robot.
+        UserError: if there is neither, or the robot is unknown.
     """
     robot = find_robot(robot or NAO.name).robot.name
     folder = results.latest_folder("walk", status="finished", robot=robot)
@@ -151,10 +151,10 @@ def default_policy(robot: str | None = None) -> Path:
 
 
 def shipped_policy(robot: str | None = None) -> Path:
-    """Return the policy of a robot, by default the NAO, that comes with the project.
+    """Return the shipped policy of a robot, by default the NAO.
 
     Raises:
-        UserError: if there is none, or no such robot.
+        UserError: if there is none, or the robot is unknown.
     """
     robot = find_robot(robot or NAO.name).robot.name
     shipped = sorted(policies_folder(robot).glob("*.npz"))
@@ -167,14 +167,14 @@ def shipped_policy(robot: str | None = None) -> Path:
 
 
 def load_walking_policy(path: Path, robot: str | None = None) -> Learned:
-    """Read a policy file and see that it is one of walking.
+    """Load a policy file and check that it is a walking policy.
 
     Args:
         path: the file.
-        robot: whose policy it has to be; None is anyone's.
+        robot: name of the robot that the policy must have; None accepts any.
 
     Raises:
-        UserError: if it is not, or is unreadable, or of an unknown robot.
+        UserError: if it is another policy, unreadable, or of an unknown robot.
     """
     policy = load(path)
     if policy.parameters.names != PARAM_NAMES:
@@ -186,9 +186,7 @@ def load_walking_policy(path: Path, robot: str | None = None) -> Learned:
         is_finite = False
     if not is_finite:
         wanted = ", ".join(Balance._fields)
-        raise UserError(
-            f"{path} does not say how its steps were balanced: expected {wanted}, got {policy.task}"
-        )
+        raise UserError(f"{path} must have the balance of its steps, {wanted}, got {policy.task}")
     try:
         found = robot_of(policy).name
     except UserError as error:
@@ -199,7 +197,7 @@ def load_walking_policy(path: Path, robot: str | None = None) -> Learned:
 
 
 def robot_of(policy: Learned) -> Robot:
-    """Return the robot that a policy was learned with: the NAO where the file, an older one, does not say.
+    """Return the robot that a policy was learned with; older files do not name it, and are the NAO's.
 
     Raises:
         UserError: if it is unknown.
@@ -208,5 +206,5 @@ def robot_of(policy: Learned) -> Robot:
 
 
 def balance_of(policy: Learned) -> Balance:
-    """Return how the steps of a policy answered to the measured orientation while it was learned."""
+    """Return the gains of the response to the measured orientation that a policy was learned with."""
     return Balance(**policy.task["balance"])

@@ -1,4 +1,4 @@
-"""Set up the process before jax and MuJoCo start: devices, threads, the compilation cache, quiet imports."""
+"""Set up the process before jax and MuJoCo are imported: devices, threads, compilation cache."""
 
 import _thread
 import contextlib
@@ -11,8 +11,8 @@ from typing import Any
 
 from creps_jax.errors import UserError
 
-# One thread a device, and the small matrix products of the physics without the set-up costs of a library
-# for large ones. XLA ends the process on a flag it does not know: jaxlib 0.9.0 and 0.12.0 know both.
+# One thread for each device, and small matrix products without the set-up costs of a library for large ones.
+# XLA ends the process on an unknown flag: jaxlib 0.9.0 and 0.12.0 know both.
 XLA_FLAGS = ("--xla_cpu_multi_thread_eigen=false", "--xla_cpu_experimental_ynn_fusion_type=")
 
 
@@ -24,32 +24,32 @@ def usable_cores() -> int:
 
 
 def cache_folder() -> Path:
-    """Return the user's cache folder for compiled programs; it may not exist yet."""
+    """Return the folder of the compilation cache; it may not exist yet."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "creps_jax" / "jax"
 
 
 def prepare() -> None:
-    """Set what jax reads from the environment when it starts; what the user has set stays.
+    """Set the environment variables that jax reads when it is imported; variables of the user are kept.
 
-    One CPU device a core, each with one thread, steps a batch about twice as fast as one device
-    with many threads. The compilation cache saves most of the compiling in the next process.
+    One CPU device for each core, each with one thread, steps a batch about twice as fast as one device with
+    many threads. The compilation cache saves most of the time for compiling in the next process.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     ours = [flag for flag in XLA_FLAGS if flag.partition("=")[0] not in flags]
     os.environ["XLA_FLAGS"] = " ".join([*flags.split(), *ours])
     if "xla_force_host_platform_device_count" not in flags:
         os.environ.setdefault("JAX_NUM_CPU_DEVICES", str(usable_cores()))
-    # Nor may the small factorisations of an update spin threads of their own against the devices': on
-    # busy cores that made one a hundred times slower.
+    # Threads of OpenBLAS compete with the threads of the devices: on busy cores the small factorisations of
+    # an update were a hundred times slower.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        # Without a writable home there is no cache, and nothing else changes.
+        # If the home folder is not writable there is no cache.
         with contextlib.suppress(OSError, RuntimeError):
             folder = cache_folder()
             folder.mkdir(parents=True, exist_ok=True)
             os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-    # jax 0.9 would fill the screen with processor features, none of them missing, for each cached program.
+    # jax 0.9 prints many lines about processor features for each cached program.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
@@ -58,11 +58,11 @@ def prepare() -> None:
 def join_processes() -> None:
     """Let this process and its peers share their devices, before jax does anything else.
 
-    SLURM, Open MPI and Kubernetes tell each process what it has to know. Elsewhere the environment does:
+    Under SLURM, Open MPI and Kubernetes jax needs no settings. Elsewhere set the environment variables
     JAX_COORDINATOR_ADDRESS (host:port of the first process), JAX_NUM_PROCESSES and JAX_PROCESS_ID (from 0).
 
     Raises:
-        UserError: if neither does, or the others are not to be reached.
+        UserError: if these are missing, or the other processes cannot be reached.
     """
     import jax
 
@@ -82,10 +82,10 @@ def join_processes() -> None:
 
 
 def import_mjx_quietly() -> None:
-    """Import MJX while its lines about a missing Warp are kept from stdout.
+    """Import MJX without its messages about a missing Warp.
 
     Raises:
-        UserError: if MuJoCo cannot start with the OpenGL that the environment names.
+        UserError: if MuJoCo cannot use the OpenGL that MUJOCO_GL names.
     """
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(ImportError):
@@ -100,7 +100,7 @@ def import_mjx_quietly() -> None:
 
 
 def keep_interrupts() -> None:
-    """Interrupt again where Ctrl-C came in a callback, such as a finaliser, that lets no exception out."""
+    """Interrupt again if Ctrl-C came in a callback that drops exceptions, such as a finaliser."""
     tell = sys.unraisablehook
 
     def hook(unraisable: Any) -> None:

@@ -1,4 +1,4 @@
-"""Write tables of results beside the paper's, as CSV for programs and Markdown for people."""
+"""Tables of results and of the paper, as CSV or Markdown."""
 
 import csv
 import io
@@ -9,7 +9,7 @@ import numpy as np
 
 from creps_jax import files
 
-# Table 2 of Abdolmaleki et al. 2016: speed asked for (m/s), and the rewards of both policies.
+# Table 2 of Abdolmaleki et al. 2016: asked speeds (m/s), and the rewards of both policies.
 PAPER_SPEEDS = (0.10, 0.15, 0.20, 0.25, 0.30, 0.35, 0.40, 0.45, 0.50, 0.55, 0.60)
 PAPER_LINEAR = (
     -1.057,
@@ -49,7 +49,7 @@ def to_markdown(columns: Mapping[str, Sequence[object]]) -> str:
 
 
 def save_table(columns: Mapping[str, Sequence[object]], folder: Path, say: Callable[[str], None]) -> None:
-    """Write a table into a result folder as Markdown, and say it."""
+    """Write a table into a result folder as Markdown, and print it."""
     text = to_markdown(columns)
     files.save_text(folder / "table.md", text)
     say(text)
@@ -58,7 +58,7 @@ def save_table(columns: Mapping[str, Sequence[object]], folder: Path, say: Calla
 def speed_table(
     asked: np.ndarray, reward: np.ndarray, speed: np.ndarray, fell: np.ndarray
 ) -> dict[str, list[object]]:
-    """Gather a walking policy's evaluation in columns, beside the paper's rows at the paper's speeds.
+    """Return the evaluation of a walking policy as columns, at the paper's speeds with its rewards.
 
     Args:
         asked: (n,) asked speeds, m/s.
@@ -79,7 +79,7 @@ def speed_table(
 
 
 def are_the_papers(asked: np.ndarray) -> bool:
-    """Say whether speeds (m/s) are those of the paper's Table 2."""
+    """Return whether speeds (m/s) are the speeds of the paper's Table 2."""
     return len(asked) == len(PAPER_SPEEDS) and np.allclose(asked, PAPER_SPEEDS, atol=1e-4)
 
 

@@ -1,7 +1,7 @@
-"""Film recorded walks with MuJoCo's renderer, several side by side, where there is OpenGL.
+"""Film recorded walks with MuJoCo's renderer, several side by side; this needs OpenGL.
 
-Rendering happens in a process of its own: a graphics driver that fails or crashes takes no run
-down with it, and the choice of a graphics library stays out of the parent.
+A new process renders: if the graphics driver crashes, the run continues, and the choice of a graphics library
+does not affect this process.
 """
 
 import contextlib
@@ -26,13 +26,13 @@ _TIME_LIMIT = 600
 
 
 class Clip(NamedTuple):
-    """A recorded walk and what to write over it.
+    """A recorded walk and its caption.
 
     Attributes:
         caption: one line of text.
         qpos: (n, nq) generalised positions.
         period: seconds between two of them.
-        slope: degrees by which the floor, in whose frame positions are, rises ahead.
+        slope: slope of the floor, deg, positive if it rises ahead; positions are in the frame of the floor.
     """
 
     caption: str
@@ -42,20 +42,21 @@ class Clip(NamedTuple):
 
 
 class VideoError(UserError):
-    """No video could be made; the message says why, and what may help."""
+    """A video cannot be made; the message has the reason, and what may help."""
 
 
 def write_video(path: Path, model: Path, clips: Sequence[Clip], *, still_at: float | None = None) -> None:
-    """Film walks side by side, each followed by a camera of its own.
+    """Film walks side by side, each with a camera that follows the robot.
 
     Args:
-        path: the .mp4 file to write, atomically.
+        path: the .mp4 file, written atomically.
         model: the MJCF file of the robot.
-        clips: the walks; a shorter one stands still at its end.
-        still_at: the time in seconds of a finer frame to write beside the video, as .png; None for none.
+        clips: the walks; a shorter one stops at its last frame.
+        still_at: time in seconds of a frame in better quality, written next to the video as .png; None writes
+            none.
 
     Raises:
-        VideoError: if nothing can be rendered, for want of OpenGL for example.
+        VideoError: if rendering fails, for example without OpenGL.
         UserError: if the file cannot be written.
     """
     if not clips:
@@ -102,7 +103,7 @@ def _explain(code: int, output: str) -> str:
 
 
 def _render_job(job: Path, video: Path, still: Path) -> None:
-    """Do the work in the child process."""
+    """Render in the child process."""
     import imageio_ffmpeg
     import mujoco
     from PIL import Image
@@ -138,15 +139,15 @@ def _render_job(job: Path, video: Path, still: Path) -> None:
 def _frames(
     model, clips: Sequence[Clip], *, scale: int, fine: bool = False, at: float | None = None
 ) -> Iterator[np.ndarray]:
-    """Yield the frames of a video, or the one at a time: a grid of cells, one for each clip.
+    """Yield the frames of a video, or the frame at a time: a grid of cells, one for each clip.
 
     Args:
         model: the compiled robot.
         clips: the walks.
-        scale: how many times larger than CELL_SIZE a cell is drawn.
+        scale: size of a cell, as a factor of CELL_SIZE.
         fine: whether to draw shadows and smooth edges; otherwise cells are drawn at twice their size
             and averaged, which is three times as fast without a graphics card.
-        at: time of the only frame, s.
+        at: time of the only frame, s; None is all frames.
     """
     import mujoco
     from PIL import Image
@@ -183,7 +184,7 @@ def _frames(
 
 
 def _tilt(data, slope: float) -> np.ndarray:
-    """Turn all that is drawn from the frame of the floor to the vertical, and return the rotation."""
+    """Rotate all geoms from the frame of the floor to the vertical, and return the rotation."""
     angle = math.radians(slope)
     rotation = np.array(
         [[math.cos(angle), 0.0, -math.sin(angle)], [0.0, 1.0, 0.0], [math.sin(angle), 0.0, math.cos(angle)]]
@@ -208,7 +209,7 @@ def _captioned(image, caption: str, seconds: float, scale: int) -> np.ndarray:
 
 
 def _smooth(path: np.ndarray, window: int) -> np.ndarray:
-    """Average a path over a window, so that a camera that follows it does not sway with each step."""
+    """Average a path over a window, so that the camera does not sway with each step."""
     window = max(1, min(window, len(path)))
     padded = np.concatenate(
         [

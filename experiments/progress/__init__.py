@@ -1,4 +1,4 @@
-"""Show how a run is getting on: a live view in a terminal, a line every few seconds elsewhere."""
+"""Show the progress of a run: a live view in a terminal, else a line every few seconds."""
 
 from experiments.progress.by_context import PooledSamples
 from experiments.progress.live import Progress, Row

@@ -15,10 +15,10 @@ class PooledSamples(NamedTuple):
     """The new samples of an iteration, of all trials (leading axis n).
 
     Attributes:
-        context: the first variable of their contexts.
-        reward: their rewards.
-        speed: the speed at which each walked, m/s, where the context is the one that was asked for.
-        fall_share: the share of its rollouts that fell; None where nothing can fall.
+        context: the first context variable.
+        reward: rewards.
+        speed: reached speeds, m/s, if the context is the asked speed; None otherwise.
+        fall_share: share of the rollouts of a sample with a fall; None if nothing can fall.
     """
 
     context: np.ndarray
@@ -28,7 +28,7 @@ class PooledSamples(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Means over samples of nearly the same context: NaN where there are none, None as in `PooledSamples`."""
+    """Means over samples of similar contexts: NaN without samples, None as in `PooledSamples`."""
 
     context: float
     reward: float
@@ -47,15 +47,15 @@ class Recent:
         return len(self._kept)
 
     def add(self, samples: PooledSamples) -> None:
-        """Take in an iteration, in place of the oldest one if need be."""
-        # The range only grows, so that groups do not jump to and fro.
+        """Add an iteration; the oldest one is dropped if there are too many."""
+        # The range only grows, so that the groups are stable.
         self._low = min(self._low, float(samples.context.min()))
         self._high = max(self._high, float(samples.context.max()))
         self._kept.append(samples)
 
     def groups(self, most: int) -> list[Group]:
-        """Return at most `most` groups, one for each round context within the range so far."""
-        kept = tuple(self._kept)  # a view is drawn by a thread of its own
+        """Return at most `most` groups, one for each round number within the range so far."""
+        kept = tuple(self._kept)  # another thread draws the view
         if not kept or most < 1:
             return []
         step = _round_step(self._low, self._high, min(most, _MOST_GROUPS))
@@ -73,7 +73,7 @@ class Recent:
 
 
 def _round_step(low: float, high: float, most: int) -> float:
-    """Return the least round step of which at most so many multiples are nearest to a part of the range."""
+    """Return the smallest round step with which the range has at most `most` groups."""
     power = math.floor(math.log10(max(high - low, 1e-3 * abs(high), 1e-9) / most))
     steps = (factor * 10.0**exponent for exponent in range(power, power + 4) for factor in _ROUND_STEPS)
     widest = 4 * max(abs(low), abs(high), 1e-9)

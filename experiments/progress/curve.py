@@ -6,22 +6,22 @@ from collections.abc import Sequence
 import numpy as np
 
 _BRAILLE = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
-"""What each dot of a braille character adds to its code."""
+"""The value of each dot in the code of a braille character."""
 _SPAN_OF_LOG = 30.0
-"""Losses that differ by more than this factor are drawn on a logarithmic scale."""
+"""Negative rewards that differ by more than this factor are drawn on a logarithmic scale."""
 
 
 def draw_curve(rewards: Sequence[float], width: int, height: int, *, unicode: bool = True) -> list[str]:
-    """Draw rewards against iterations, on a logarithmic scale of what they lack to zero where that helps.
+    """Draw rewards against iterations, on a logarithmic scale of negative rewards if they differ by much.
 
     Args:
-        rewards: mean reward of each iteration from the first on; what is not finite leaves a gap.
-        width: characters of each line, those of the axis included.
-        height: lines, that of the axis included.
-        unicode: whether the reader can show braille and line characters.
+        rewards: mean reward of each iteration; numbers that are not finite leave a gap.
+        width: characters of each line, including the axis.
+        height: number of lines, including the axis.
+        unicode: whether the terminal can show braille and line characters.
 
     Returns:
-        The lines; none where there is nothing to draw, or no room for it.
+        The lines; none without rewards or room.
     """
     rows = height - 1
     finite = [reward for reward in rewards if math.isfinite(reward)]
@@ -48,7 +48,7 @@ def draw_curve(rewards: Sequence[float], width: int, height: int, *, unicode: bo
 
 
 class _Scale:
-    """Where a reward lies between the bottom (0) and the top (1) of a drawing."""
+    """The vertical scale of the drawing, from 0 at the bottom to 1 at the top."""
 
     def __init__(self, rewards: Sequence[float]):
         losses = [-reward for reward in rewards if reward < 0]
@@ -57,18 +57,18 @@ class _Scale:
         self._low, self._high = (float(self.place(pick(rewards))) for pick in (min, max))
 
     def place(self, reward: np.ndarray | float) -> np.ndarray:
-        """Return rewards on the scale: themselves, or the logarithm of what they lack to zero."""
+        """Return the places of rewards: the rewards, or minus the logarithm of negative rewards."""
         if not self._is_log:
             return np.asarray(reward, float)
         return -np.log10(np.maximum(-np.asarray(reward, float), self._least_loss))
 
     def to_unit(self, places: np.ndarray) -> np.ndarray:
-        """Return places on the scale as shares of the height."""
+        """Return places as shares of the height."""
         span = self._high - self._low
         return (places - self._low) / span if span > 0 else np.where(np.isfinite(places), 0.5, np.nan)
 
     def labels(self, rows: int) -> dict[int, str]:
-        """Return the numbers beside rows, which count from the top: round ones if there are two."""
+        """Return the labels of rows, counted from the top: round numbers if at least two fit."""
         best: dict[int, str] = {}
         for ticks in self._tick_sets():
             shares = self.to_unit(self.place(np.array(ticks)))
@@ -106,7 +106,7 @@ class _Scale:
 
 
 def _resample(rewards: Sequence[float], scale: _Scale, columns: int) -> np.ndarray:
-    """Return one place on the scale for each column: means of neighbours, or points between them."""
+    """Return a place for each column: means of several rewards, or interpolated ones."""
     values = np.asarray(rewards, float)
     if len(values) > columns:
         chunks = np.split(values, np.arange(1, columns) * len(values) // columns)
@@ -125,7 +125,7 @@ def _trace(heights: np.ndarray, rows: int) -> np.ndarray:
             before = None
             continue
         row = round((1 - min(max(height, 0.0), 1.0)) * (rows - 1))
-        # From beside the last row, so that steep stretches stay one dot wide.
+        # Start next to the last row, so that steep lines are one dot wide.
         start = row if before is None else before + int(np.sign(row - before))
         pixels[min(start, row) : max(start, row) + 1, column] = 1
         before = row

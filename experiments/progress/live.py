@@ -1,4 +1,4 @@
-"""Take in the iterations of a run, and show them."""
+"""Show the iterations of a run."""
 
 import math
 import sys
@@ -16,18 +16,18 @@ from experiments.progress.view import View, draw
 
 
 class Row(NamedTuple):
-    """What one iteration tells the reader.
+    """The values of an iteration.
 
     Attributes:
-        iteration: how many iterations are done, this one included.
-        episodes: rollouts so far, repeats included.
-        mean_reward: mean over the iteration's samples.
-        fall_share: share of the iteration's rollouts that fell; None where nothing can fall.
+        iteration: number of iterations done, including this one.
+        episodes: rollouts so far, including repeats.
+        mean_reward: mean over the samples of the iteration.
+        fall_share: share of its rollouts with a fall; None if nothing can fall.
         kl: KL divergence of the sample weights.
-        p_value: of the test on evidence, see `CrepsInfo`; the median of the trials.
-        unsupported_loss: entropy that went without evidence so far, in nats; the mean of the trials.
-        simulated_seconds: simulated time of the iteration; None where nothing is simulated.
-        samples: the iteration's samples; None where they are not known.
+        p_value: p-value of the test on evidence, see `CrepsInfo`; the median of the trials.
+        unsupported_loss: entropy lost without evidence so far, in nats; the mean of the trials.
+        simulated_seconds: simulated time of the iteration; None without simulation.
+        samples: samples of the iteration; None if they are unknown.
     """
 
     iteration: int
@@ -45,12 +45,12 @@ class Progress:
     """Show the rows of a run; use it as a context manager.
 
     Args:
-        title: what is running.
-        iterations: how many iterations the run has.
-        earlier: mean rewards of the iterations that were done before, by a run that is resumed.
-        timestep: physics time step in seconds, to count steps a second; None where there is none.
-        console: where to; by default stdout.
-        every: seconds between two lines where there is no terminal.
+        title: name of the run.
+        iterations: number of iterations of the run.
+        earlier: mean rewards of the iterations before the run was resumed.
+        timestep: physics time step in seconds, to report steps per second; None without physics.
+        console: console of the output; stdout by default.
+        every: seconds between two lines if there is no terminal.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class Progress:
             self._live.stop()
 
     def update(self, row: Row) -> None:
-        """Take in the row of an iteration that has just ended."""
+        """Add the row of an iteration."""
         now = time.monotonic()
         if self._row is None:
             self._first = now
@@ -108,7 +108,7 @@ class Progress:
             self._console.print("  ".join(f"{name} {value}" for name, value in self._cells()))
 
     def seconds_left(self) -> float:
-        """Estimate the time left; NaN until two iterations have ended, as the first one compiles."""
+        """Estimate the time left; NaN before the end of the second iteration, as the first one compiles."""
         counted = len(self._rewards) - self._done - 1
         if self._row is None or counted < 1:
             return math.nan
@@ -146,13 +146,13 @@ class Progress:
         done = self._row.iteration if self._row else self._done
         view = View(self._title, self._iterations, done, self._cells(), tuple(self._rewards), self._recent)
         unicode = "utf" in (self._console.encoding or "").lower()
-        # A ^C that the terminal echoes behind the last line must not begin a new one.
+        # The terminal prints ^C after the last line: it must fit into this line.
         lines = draw(view, max(width - len("^C"), 1), height - 1, unicode=unicode)
         self._drawn = width, [len(line) for line in lines]
         return Group(*lines)
 
     def _wipe_wrapped(self, width: int) -> None:
-        """Go up over what a terminal that became narrower has wrapped, which `Live` does not know of."""
+        """Erase the lines that wrapped when the terminal became narrower; `Live` does not count them."""
         width_before, lengths = self._drawn
         if width < width_before:
             wrapped = sum((length - 1) // width for length in lengths if length)
@@ -161,7 +161,7 @@ class Progress:
 
 
 def clock(seconds: float) -> str:
-    """Write a time as minutes:seconds, or hours:minutes:seconds; a dash where it is unknown."""
+    """Write a time as minutes:seconds, or hours:minutes:seconds; a dash if it is unknown."""
     if not math.isfinite(seconds):
         return "-"
     minutes, second = divmod(round(seconds), 60)

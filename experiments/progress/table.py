@@ -14,7 +14,7 @@ _SHORTEST_BAR = 4
 
 
 class _Bar(NamedTuple):
-    """A length, and a mark to be reached, as shares of the longest bar; NaN draws none."""
+    """The length of a bar and the place of a mark, as shares of the longest bar; NaN draws none."""
 
     share: float
     mark: float = math.nan
@@ -28,17 +28,17 @@ class _Column(NamedTuple):
 
 
 def draw_table(groups: Sequence[Group], width: int, *, unicode: bool = True) -> list[Text]:
-    """Set groups out in lines: context, speed or reward, falls, with bars where there is room for them.
+    """Lay out groups in lines: context, speed or reward, falls, and bars if there is room for them.
 
-    A bar of the speed is followed by a mark at the speed that was asked for, where it falls short of it.
+    The bar of a speed below the asked speed has a mark at the asked speed.
 
     Args:
         groups: the groups, all with the same fields.
-        width: characters that a line may have.
-        unicode: whether the reader can show block characters.
+        width: greatest length of a line, characters.
+        unicode: whether the terminal can show block characters.
 
     Returns:
-        The lines, the first one the header; none where there is nothing to show, or no room for it.
+        The lines; the first one is the header. None without groups or room.
     """
     columns = _columns(groups) if groups else []
     widths = [max(map(len, (column.name, *column.texts))) for column in columns]

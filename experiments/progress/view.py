@@ -1,4 +1,4 @@
-"""Set out how a run is getting on in lines that fit a terminal of any size."""
+"""Lay out the progress of a run in lines that fit a terminal of any size."""
 
 import math
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ from experiments.progress.by_context import Recent
 from experiments.progress.curve import draw_curve
 from experiments.progress.table import draw_table
 
-# Characters, lines, and a share of the width.
+# Sizes in characters and lines, and a share of the width.
 _WIDEST = 110
 _HIGHEST_CURVE = 12
 _LOWEST_CURVE = 5
@@ -22,12 +22,12 @@ _FEWEST_GROUPS = 3
 
 
 class View(NamedTuple):
-    """What there is to show.
+    """The content of the view.
 
     Attributes:
-        title: what is running.
-        iterations: how many iterations the run has.
-        done: how many of them are done.
+        title: name of the run.
+        iterations: number of iterations of the run.
+        done: number of iterations done.
         cells: names and values, as text.
         rewards: mean reward of each iteration so far.
         recent: the samples of the last iterations.
@@ -44,7 +44,7 @@ class View(NamedTuple):
 def draw(view: View, width: int, height: int, *, unicode: bool = True) -> list[Text]:
     """Draw the view in at most `height` lines of at most `width` characters.
 
-    What matters most comes first: in a short terminal the table goes, then the curve.
+    A short terminal shows no table, and a shorter one no curve.
     """
     width = min(width, _WIDEST)
     lines = [Text(view.title, style="bold"), _bar(view, width, unicode), *_flow(view.cells, width)]
@@ -66,7 +66,7 @@ def _bar(view: View, width: int, unicode: bool) -> Text:
 
 
 def _flow(cells: Sequence[tuple[str, str]], width: int) -> list[Text]:
-    """Set names and values side by side in as many lines as they need."""
+    """Lay out names and values side by side, in lines of at most `width` characters."""
     lines = [Text()]
     for name, value in cells:
         cell = Text.assemble((name, "dim"), " " * bool(name), value)
@@ -79,7 +79,7 @@ def _flow(cells: Sequence[tuple[str, str]], width: int) -> list[Text]:
 
 
 def _body(view: View, width: int, rows: int, unicode: bool) -> list[Text]:
-    """Put the table beside the curve, or below it where the terminal is narrow."""
+    """Put the table beside the curve, or below it in a narrow terminal."""
     table_width = max(round(_TABLE_SHARE * width), _NARROWEST_TABLE)
     if width - table_width - _GAP < _NARROWEST_CURVE:
         rows_of_table = rows - max(_LOWEST_CURVE, rows // 2)

@@ -1,4 +1,4 @@
-"""Take a policy away: write it, or a walk that it makes, for use without this project."""
+"""Export a policy, or one of its walks, to programs without this package."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -27,19 +27,19 @@ def export(
     """Write a policy as .onnx or .h (C), or the joint set-points of one of its walks as .csv or .npz.
 
     Args:
-        to: the file; its ending says what it shall be. One that is there is overwritten.
+        to: the file; its ending decides on the format. An existing file is overwritten.
         policy: policy file; None is the latest learned walking policy of the robot, or else the shipped one.
-        robot: whose walking policy it is; None is the policy's robot, or without a policy the NAO.
-        speed: speed of the walk, m/s; only for a walk, which needs it.
+        robot: name of the robot; None is the robot of the file, or without a file the NAO.
+        speed: speed of the walk, m/s; required for a walk, and only for a walk.
         duration: length of the walk, s; only for a walk, 8 by default.
-        say: told one line at a time.
+        say: prints one line.
 
     Raises:
         UserError: for a mistake in the request, an unreadable policy, or a file that cannot be written.
     """
     ending = to.suffix.lower()
     _check_request(to, ending, speed, duration)
-    # Everything else is imported late: it takes seconds, and mistakes are answered at once.
+    # The other imports take seconds: mistakes are reported before.
     path = policy or _default_policy(robot)
     if _are_the_same(to, path):
         raise UserError(f"--to {to} is the policy file itself, name another file")
@@ -60,7 +60,7 @@ def export(
 
 
 def _check_request(to: Path, ending: str, speed: float | None, duration: float | None) -> None:
-    """Refuse an unknown ending, and options that do not go with it."""
+    """Refuse an unknown ending, and options that it does not have."""
     if ending in _OF_WALK:
         if speed is None:
             raise UserError(f"{to} would hold the joint set-points of a walk, which need --speed, in m/s")

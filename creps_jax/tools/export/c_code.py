@@ -1,4 +1,4 @@
-"""Hold the C code that a policy is written as; `c_header` fills it in."""
+"""Templates of the C code of a policy; `c_header` fills them in."""
 
 from string import Template
 
@@ -68,7 +68,7 @@ LINEAR = """\
     }
 """
 
-# The largest exponent is taken from all of them, so that the weights cannot all vanish.
+# The largest exponent is subtracted from all, so that the weights cannot all be zero.
 RBF = """\
     float largest = 0.0f, sum = 0.0f;
     for (i = 0; i < ${PREFIX}_NUM_FEATURES; ++i) {
@@ -99,5 +99,5 @@ _SQUASH = """\
 _CLIP = """\
         value = value < low ? low : value > high ? high : value;
 """
-# After a sigmoid the clip takes back the last bit that rounding can put outside the box.
+# After a sigmoid, rounding can exceed the bounds by the last bit.
 HOLD_BOUNDS = {"none": "", "clip": _BOUNDS + _CLIP, "sigmoid": _BOUNDS + _SQUASH + _CLIP}

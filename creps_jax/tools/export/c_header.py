@@ -1,4 +1,4 @@
-"""Write a policy as a C header that needs nothing but expf, for microcontrollers and robots."""
+"""Write a policy as a C header that needs only expf, for microcontrollers and robots."""
 
 import re
 import string
@@ -13,21 +13,20 @@ from creps_jax.policies.learned import Learned
 from creps_jax.tools.export.c_code import HEADER, HOLD_BOUNDS, LINEAR, RBF
 from creps_jax.tools.export.formula import Formula, formula_of
 
-# Characters that stand for themselves in a C string: no quotes, backslashes, nor "?", of which two begin
-# a trigraph.
+# Characters that need no escape in a C string: not quotes, backslashes, nor "?", as "??" starts a trigraph.
 _PLAIN = string.ascii_letters + string.digits + " _.,:;/^*+-=%()[]"
 
 
 def save(path: Path, policy: Learned) -> None:
-    """Write a policy as a C header, atomically; what it declares begins with the name of the file."""
+    """Write a policy as a C header, atomically; the name of the file is the prefix of its identifiers."""
     save_text(path, make_header(policy, path.stem))
 
 
 def make_header(policy: Learned, name: str | None = None) -> str:
-    """Return a header of C99, and C++, with names, units, bounds, range and function of a policy.
+    """Return a header of C99 and C++ with names, units, bounds, range and function of a policy.
 
-    What it declares begins with the name, by default that of the task; characters that C has not become
-    underscores.
+    The name, by default the name of the task, is the prefix of all identifiers; characters that are not
+    allowed in C become underscores.
 
     Raises:
         UserError: if a number of the policy is too large for single precision.
@@ -79,7 +78,7 @@ def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
 
 
 def _prefix(name: str) -> str:
-    """Return a name as the beginning of C identifiers."""
+    """Return a name as the prefix of C identifiers."""
     name = _identifier(name).lower()
     return f"task_{name}" if name[:1].isdigit() else name or "learned"
 
@@ -89,7 +88,7 @@ def _identifier(name: str) -> str:
 
 
 def _enumerators(tag: str, names: Sequence[str]) -> list[str]:
-    """Make C identifiers of names; if two become the same one, all get their index."""
+    """Make C identifiers of names; if two are equal, all get their index."""
     stems = [f"{tag}_{_identifier(name)}".upper() for name in names]
     return stems if len(set(stems)) == len(stems) else [f"{stem}_{i}" for i, stem in enumerate(stems)]
 
@@ -112,17 +111,17 @@ def _floats(declarator: str, values: np.ndarray) -> str:
 
 
 def _lines(items: Iterable[str]) -> str:
-    """List items, each on a line of its own."""
+    """Return items, each in a line."""
     return "\n" + textwrap.indent(",\n".join(items), "    ") + "\n"
 
 
 def _string(text: str) -> str:
-    """Write a C string literal: all but plain characters as the octal numbers of their UTF-8 bytes."""
+    """Return a C string literal: other than plain characters as octal numbers of their UTF-8 bytes."""
     return '"' + "".join(chr(b) if chr(b) in _PLAIN else f"\\{b:03o}" for b in text.encode()) + '"'
 
 
 def _number(value: np.floating) -> str:
-    """Write a float literal that reads back as the same number."""
+    """Return a float literal that reads back as the same number."""
     if np.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"
     digits = f"{value:.9g}"

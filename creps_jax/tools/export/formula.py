@@ -1,4 +1,4 @@
-"""Gather the numbers by which a policy turns a context into parameters, in single precision."""
+"""The numbers with which a policy computes parameters from a context, in single precision."""
 
 from typing import NamedTuple
 
@@ -14,10 +14,10 @@ class Formula(NamedTuple):
 
     Attributes:
         context_low: (s,) lower ends of the learned range.
-        context_high: (s,) its upper ends.
-        centers: (p, s) centres of the RBFs; none (0, s) if the features are linear.
-        widths: (s,) their widths.
-        coef: (p, d) coefficients of the features; linear ones are 1 and the context variables.
+        context_high: (s,) upper ends of the learned range.
+        centers: (p, s) centres of the RBFs; (0, s) if the features are linear.
+        widths: (s,) widths of the RBFs.
+        coef: (p, d) coefficients of the features; linear features are 1 and the context variables.
         param_low: (d,) lower bounds of the parameters.
         param_high: (d,) upper bounds.
     """
@@ -32,7 +32,7 @@ class Formula(NamedTuple):
 
 
 def formula_of(learned: Learned) -> Formula:
-    """Gather the numbers of a policy.
+    """Return the numbers of a policy.
 
     Raises:
         UserError: if its features cannot be exported, or a number is too large for single precision.
@@ -60,7 +60,7 @@ def formula_of(learned: Learned) -> Formula:
     with np.errstate(over="ignore"):
         single = Formula(*(np.asarray(values, np.float32) for values in numbers))
     for name, values in single._asdict().items():
-        # Parameters without bounds have infinite ones.
+        # Parameters without bounds have infinite bounds.
         is_held = np.isfinite(values) | (np.isinf(getattr(numbers, name)) & name.startswith("param"))
         if not is_held.all():
             raise UserError(f"{name} of the policy is too large for single precision")

@@ -13,8 +13,8 @@ from creps_jax.policies.features import describe
 from creps_jax.policies.learned import Learned
 from creps_jax.tools.export.formula import Formula, formula_of
 
-# As old as the operators allow (a ReduceSum whose axes are an input is of opset 13), so that old runtimes
-# read it too.
+# The oldest versions with these operators (ReduceSum has its axes as an input since opset 13), so that old
+# runtimes can read the model.
 OPSET = 13
 IR_VERSION = 7
 
@@ -28,8 +28,8 @@ def save(path: Path, policy: Learned) -> None:
 def make_model(policy: Learned) -> onnx.ModelProto:
     """Build the model: `context` (batch, s) to `parameters` (batch, d) and `in_range` (batch,).
 
-    Context variables outside the learned range count as at its nearest end, NaN as at the lower one;
-    `in_range` is true where there are none. The metadata has names, units, bounds and range, as JSON.
+    Context variables outside the learned range are clamped to it, NaN to the lower end; `in_range` is true if
+    all are inside. The metadata has names, units, bounds and range as JSON.
 
     Raises:
         UserError: if a number of the policy is too large for single precision.
@@ -67,7 +67,7 @@ def _clamp() -> list[onnx.NodeProto]:
         _node("not_above", "LessOrEqual", "raised", "context_high"),
         _node("nearest", "Where", "not_above", "raised", "context_high"),
         _node("is_inside", "And", "not_below", "not_above"),
-        # There is no "all" of booleans.
+        # ONNX has no "all" of booleans.
         _node("inside", "Cast", "is_inside", to=TensorProto.FLOAT),
         _node("all_inside", "ReduceMin", "inside", axes=[1], keepdims=0),
         _node("in_range", "Cast", "all_inside", to=TensorProto.BOOL),
@@ -105,14 +105,14 @@ def _hold_bounds(constraint: str) -> list[onnx.NodeProto]:
     is_squashed = constraint == "sigmoid"
     return [
         *(squash if is_squashed else []),
-        # After a sigmoid this takes back the last bit that rounding can put outside the box.
+        # After a sigmoid, rounding can exceed the bounds by the last bit.
         _node("not_too_low", "Max", "squashed" if is_squashed else "mean", "param_low"),
         _node("parameters", "Min", "not_too_low", "param_high"),
     ]
 
 
 def _constants(formula: Formula) -> dict[str, np.ndarray]:
-    """Name all constants that a node may use."""
+    """Return all constants that a node may use, by name."""
     return formula._asdict() | {
         "intercept": formula.coef[0],
         "slope": formula.coef[1:],
@@ -128,7 +128,7 @@ def _node(output: str, operator: str, *inputs: str, **attributes: Any) -> onnx.N
 
 
 def _metadata(policy: Learned) -> dict[str, Any]:
-    """List what a user of the model has to know."""
+    """Return the metadata of the model."""
     return {
         "task": dict(policy.task),
         "context_names": policy.contexts.names,
@@ -144,13 +144,13 @@ def _metadata(policy: Learned) -> dict[str, Any]:
 
 
 def _description(policy: Learned) -> str:
-    """Say in words what the model computes."""
+    """Return a description of the model."""
     ranges = zip(
         policy.contexts.names, policy.contexts.low, policy.contexts.high, policy.contexts.units, strict=True
     )
     learned = ", ".join(f"{name} {low:g} to {high:g} {unit}".rstrip() for name, low, high, unit in ranges)
     return (
         f"Parameters of the task {policy.task.get('name', 'unknown')} for a context, by a policy that was "
-        f"learned with creps_jax. Learned range: {learned}. A context outside of it counts as at its nearest "
-        "end, and in_range is false."
+        f"learned with creps_jax. Learned range: {learned}. A context outside is clamped to the range, "
+        "and in_range is false."
     )

@@ -1,4 +1,4 @@
-"""Write the joint set-points of one walk, for a robot that plays them."""
+"""Write the joint set-points of a walk, for a robot that plays them."""
 
 from functools import partial
 from pathlib import Path
@@ -17,12 +17,12 @@ from creps_jax.tools.play import load_walking_policy, robot_of
 from creps_jax.walking.params import params_from_theta
 from creps_jax.walking.set_points import open_loop_set_points
 
-# Time and place grow along the way, and lose digits in single precision.
+# Time and position grow during the walk, and lose digits in single precision.
 _LONGEST = 600.0
 
 
 class Trajectory(NamedTuple):
-    """The set-points of a walk from standstill, one each control step.
+    """The set-points of a walk from standstill, for each control step.
 
     Attributes:
         speed: asked speed, m/s.
@@ -36,20 +36,21 @@ class Trajectory(NamedTuple):
 
 
 def plan(path: Path, speed: float, duration: float, *, robot: str | None = None) -> Trajectory:
-    """Plan a walk at a speed, with the engine alone.
+    """Plan a walk at a speed, by the walking engine without simulation.
 
-    The trunk is taken to lean as intended at all times, without noise. Posture feedback, which answers to
-    the measured lean, is left out: a robot that plays this has to keep its balance by other means, or walk
-    where little disturbs it.
+    The trunk has its intended lean at all times, without noise. There is no posture feedback, which needs the
+    measured lean: a robot that plays this walk must keep its balance by other means, or walk where little
+    disturbs it.
 
     Args:
         path: policy file.
         speed: asked speed, m/s.
         duration: length of the walk, s.
-        robot: whose policy it has to be; None is anyone's.
+        robot: name of the robot that the policy must have; None accepts any.
 
     Raises:
-        UserError: if it is no policy of walking, or of another robot, or speed or duration are out of range.
+        UserError: if it is not a walking policy, or of another robot, or if speed or duration are out of
+            range.
     """
     policy = load_walking_policy(path, robot)
     if policy.task.get("name") != "walk":
@@ -66,7 +67,7 @@ def save_csv(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory as CSV: a header with units, then time and joints, a row for each control step."""
     columns: dict[str, list[object]] = {"time (s)": [f"{time:.2f}" for time in trajectory.time]}
     for name, angles in zip(JOINT_NAMES, trajectory.set_point.T, strict=True):
-        # As short as single precision allows: each reads back as the same number.
+        # The shortest decimals that read back as the same single-precision number.
         columns[f"{name} (rad)"] = [str(angle) for angle in angles]
     save_text(path, tables.to_csv(columns))
 
