@@ -39,14 +39,27 @@ class Contender(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class LearnerSettings:
-    """Settings of all comparisons; the paper gives samples, archive and KL bound.
+class Schedule:
+    """Numbers of iterations, trials and samples.
 
     Attributes:
         iterations: iterations of learning.
         trials: trials of each contender; the paper has 5.
         samples: N, new samples of an iteration.
         first_samples: new samples of the first iteration; None is `samples`.
+    """
+
+    iterations: int = 1000
+    trials: int = 20
+    samples: int = 40
+    first_samples: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class LearnerSettings(Schedule):
+    """Settings of all comparisons; the paper gives samples, archive and KL bound.
+
+    Attributes:
         archive_size: L, samples kept.
         kl_bound: epsilon, nats.
         ridge: relative penalty on the policy's coefficients.
@@ -60,10 +73,6 @@ class LearnerSettings:
             `creps_jax.Importance`; None is the paper's archive, in which all samples have the same weight.
     """
 
-    iterations: int = 1000
-    trials: int = 20
-    samples: int = 40
-    first_samples: int | None = None
     archive_size: int = 2000
     kl_bound: float = 0.5
     ridge: float = 1e-4
@@ -216,10 +225,17 @@ def mean_thetas(contender: Contender, coef: np.ndarray | jax.Array, contexts: ja
 
 
 def postures(
-    contender: Contender, coef: np.ndarray, contexts: jax.Array, points: Callable[[jax.Array], jax.Array]
-) -> np.ndarray:
-    """Return the postures of an arm under a mean policy: `points` of the parameters at each context."""
-    return np.asarray(jax.vmap(points)(mean_thetas(contender, coef, contexts)))
+    arrays: Arrays,
+    contenders: Mapping[str, Contender],
+    contexts: jax.Array,
+    points: Callable[[jax.Array], jax.Array],
+) -> dict[str, np.ndarray]:
+    """Return the array `postures` of contenders: `points` of the last parameters of the first trial."""
+    found = {}
+    for name, contender in contenders.items():
+        thetas = mean_thetas(contender, Part(arrays, name)["coef"][0], contexts)
+        found |= records.named(name, {"postures": jax.vmap(points)(thetas)})
+    return found
 
 
 def _grid_reward(key: jax.Array, contender: Contender, coef: np.ndarray, grid: jax.Array) -> np.ndarray:

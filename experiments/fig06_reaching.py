@@ -1,6 +1,7 @@
 """Reach via-points with a planar arm (Abdolmaleki et al. 2016, 4.2, Fig. 6 and 7)."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ from experiments.comparison import (
     postures,
 )
 from experiments.learning import Session
-from experiments.records import Arrays, Part, named
+from experiments.records import Arrays, Part
 from experiments.registry import Claim
 
 LOW, HIGH = (-1.5, -1.5), (-0.5, -0.5)
@@ -77,15 +78,10 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     }
     grid = context_grid(LOW, HIGH, 6)
     arrays = compare(contenders, settings, key, grid=grid, session=session)
-    for name in ("linear", "rbf"):
-        shown = postures(
-            contenders[name],
-            Part(arrays, name)["coef"][0],
-            jnp.array(SHOWN),
-            lambda theta: jax.vmap(arm_points)(via_point_movement(theta).pos),
-        )
-        arrays |= named(name, {"postures": shown})
-    return arrays
+    shown = {name: contenders[name] for name in ("linear", "rbf")}
+    return arrays | postures(
+        arrays, shown, jnp.array(SHOWN), lambda theta: jax.vmap(arm_points)(via_point_movement(theta).pos)
+    )
 
 
 def _linear_and_squares() -> FeatureMap:
@@ -121,20 +117,17 @@ def plot(arrays: Arrays) -> dict[str, Figure]:
 CLAIMS = (
     Claim(
         "RBFs reach as well as linear policies: p of Wilcoxon's test that they are worse",
-        None,
-        lambda arrays: p_value(arrays, "linear", "rbf"),
+        partial(p_value, better="linear", worse="rbf"),
         low=0.05,
     ),
     Claim(
         "quadratic policies reach better than linear ones: p of the same test",
-        None,
-        lambda arrays: p_value(arrays, "quadratic", "linear"),
+        partial(p_value, better="quadratic", worse="linear"),
         high=0.05,
     ),
     Claim(
         "Gaussian contexts are better than uniform ones: p of the same test",
-        None,
-        lambda arrays: p_value(arrays, "linear", "uniform"),
+        partial(p_value, better="linear", worse="uniform"),
         high=0.05,
     ),
 )

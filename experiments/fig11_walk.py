@@ -1,6 +1,7 @@
 """Compare features, constraints and fits of a walk (Abdolmaleki et al. 2016, 4.3, Fig. 10, 11a, Table 2)."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import jax
@@ -174,31 +175,26 @@ def plot(arrays: Arrays) -> dict[str, Figure]:
 CLAIMS = (
     Claim(
         "squashed parameters walk better than penalised ones: p of Wilcoxon's test",
-        None,
-        lambda arrays: p_value(arrays, "linear", "penalty"),
+        partial(p_value, better="linear", worse="penalty"),
         high=0.05,
     ),
     Claim(
         "RBFs walk better than linear policies: p of the same test",
-        None,
-        lambda arrays: p_value(arrays, "rbf", "linear"),
+        partial(p_value, better="rbf", worse="linear"),
         high=0.05,
     ),
     Claim(
         "reward of the bounded fit after half of plain C-REPS's episodes, divided by its last reward",
-        None,
         halfway_ratio,
         high=1.0,
     ),
     Claim(
         "share of plain C-REPS's episodes after which samples of the bounded fit reach its last reward",
-        None,
         lambda arrays: share_of_episodes(arrays, "plain"),
         high=0.5,
     ),
     Claim(
         "the same for weighted ML with our samples and archive",
-        None,
         lambda arrays: share_of_episodes(arrays, "unbounded"),
         high=0.5,
     ),

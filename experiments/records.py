@@ -80,6 +80,6 @@ class Walks(NamedTuple):
 
     @classmethod
     def of(cls, arrays: Arrays, trial: int | None = None) -> "Walks":
-        """Read them from a result or a part of it, all or those of one trial."""
+        """Read the walks of a result or of a part of it, for all trials or for one."""
         rows = (arrays[field] for field in cls._fields)
         return cls(*(values if trial is None else values[trial] for values in rows))

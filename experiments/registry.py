@@ -60,17 +60,17 @@ class Claim(NamedTuple):
 
     Attributes:
         metric: what is measured.
-        paper: the paper's value; None if it prints none.
         measure: from an experiment's arrays to our value.
         low: lower limit.
         high: upper limit.
+        paper: the paper's value; None if it prints none.
     """
 
     metric: str
-    paper: float | None
     measure: Callable[[Mapping[str, np.ndarray]], float]
     low: float = -np.inf
     high: float = np.inf
+    paper: float | None = None
 
 
 class Experiment(Protocol):

@@ -127,13 +127,13 @@ def plot(name: str, folder: Path | None, *, say: Say) -> Path:
     """Draw the figures of a result folder again, by default of the latest one, and return the folder.
 
     Raises:
-        UserError: if there are no results to draw, or they are those of another experiment.
+        UserError: if there are no results, or they belong to another experiment.
     """
     experiment = registry.load(name)
     folder = folder or _latest_finished(name)
     found = results.load_manifest(folder).get("experiment")
     if found != name:
-        raise UserError(f"{folder} holds results of {found}, expected those of {name}")
+        raise UserError(f"{folder} must hold results of {name}, got {found}")
     with results.complete(folder):
         _draw(experiment, files.load_arrays(folder / results.ARRAYS), folder, say)
     return folder

@@ -23,7 +23,14 @@ from creps_jax.tasks import Task, contextual_function, hole_reaching, sinus, via
 from creps_jax.tasks.functions import ackley, ellipsoid, rastrigin, rosenbrock, sphere
 from creps_jax.tools import plots
 from experiments import comparison
-from experiments.comparison import Contender, LearnerSettings, compare, make_contender, mean_policy_curve
+from experiments.comparison import (
+    Contender,
+    LearnerSettings,
+    Schedule,
+    compare,
+    make_contender,
+    mean_policy_curve,
+)
 from experiments.learning import Session
 from experiments.records import Arrays, Part, named, parts_with, traces
 from experiments.registry import Claim
@@ -50,20 +57,11 @@ FUNCTION_KL_BOUNDS = (1.0, 0.05)
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    """Settings of the experiment: 10,000 rollouts of each trial.
-
-    Attributes:
-        iterations: iterations of learning.
-        trials: trials of each contender.
-        samples: new samples of an iteration.
-        first_samples: new samples of the first iteration; None is `samples`.
-    """
+class Settings(Schedule):
+    """Settings of the experiment: 10,000 rollouts of each trial."""
 
     iterations: int = 200
-    trials: int = 20
     samples: int = 50
-    first_samples: int | None = None
 
 
 SETTINGS = {"best": Settings(), "quick": Settings(trials=4)}
@@ -235,21 +233,14 @@ def _largest_kl(arrays: Arrays) -> float:
 CLAIMS = (
     Claim(
         "sphere, weighted ML: mean reward of the last new samples (bolero's C-REPS, five seeds: -48.6)",
-        None,
         lambda arrays: _last_samples(arrays, "archive"),
         low=-48.6,
     ),
-    Claim(
-        "sphere, bounded: the same",
-        None,
-        lambda arrays: _last_samples(arrays, "bounded"),
-        low=-1e-4,
-    ),
-    Claim("sphere, bounded: largest KL of the policy, divided by its bound", None, _largest_kl, high=1.01),
+    Claim("sphere, bounded: the same", lambda arrays: _last_samples(arrays, "bounded"), low=-1e-4),
+    Claim("sphere, bounded: largest KL of the policy, divided by its bound", _largest_kl, high=1.01),
     *(
         Claim(
             f"{bench}: share of episodes after which the bounded fit is as good as weighted ML after all",
-            None,
             lambda arrays, bench=bench: share_of_episodes(arrays, bench),
             high=0.5,
         )

@@ -107,11 +107,7 @@ def plot(arrays: Arrays) -> dict[str, Figure]:
             chosen=chosen_trial(arrays),
         ),
         "speed": plots.reached_against_asked(
-            speeds,
-            walks.speed[..., 0],
-            walks.fell,
-            title="Reached against asked speed",
-            paper=lowest,
+            speeds, walks.speed[..., 0], walks.fell, title="Reached against asked speed", paper=lowest
         ),
     }
 
@@ -170,15 +166,15 @@ def _symbols() -> list[str]:
 CLAIMS = (
     Claim(
         "mean reward over the 11 speeds",
-        float(np.mean(tables.PAPER_RBF)),
         lambda arrays: float(chosen_walks(arrays).reward.mean()),
         low=-0.343,
+        paper=float(np.mean(tables.PAPER_RBF)),
     ),
-    Claim("share of falls", 0.0, lambda arrays: float(chosen_walks(arrays).fell.mean()), high=0.0),
+    Claim("share of falls", lambda arrays: float(chosen_walks(arrays).fell.mean()), high=0.0, paper=0.0),
     Claim(
         "reached speed at an asked speed of 0.6 m/s",
-        0.3,
         lambda arrays: float(chosen_walks(arrays).speed[-1, :, 0].mean()),
         low=0.5,
+        paper=0.3,
     ),
 )

@@ -144,42 +144,34 @@ def inside(arrays: Arrays, name: str) -> dict[str, np.ndarray]:
 
 def table(arrays: Arrays) -> dict[str, list[object]]:
     """Return what limits each gait, in numbers, while the robot is upright."""
-    columns: dict[str, list[object]] = {
-        "measured": [
-            "upright, s",
-            "forward, m/s",
-            "ZMP from its reference, lateral, rms mm",
-            "CoM from its plan, lateral, rms mm",
-            "leg joints from their set-points, rms deg",
-            "time with a torque at its limit, %",
-            "loaded sole slides, mm for each m walked",
-            "swing sole's height, median of its highest, mm",
-            "both soles off the floor, % of the time",
-            "largest roll, deg",
-            "heading at the end, deg",
-        ]
-    }
-    for name in GAITS:
-        seen = inside(arrays, name)
-        forward = seen["forward"]
-        rms = lambda x: float(np.sqrt(np.nanmean(np.square(x))))  # noqa: E731
-        step = seen["time"][1] - seen["time"][0]
-        slid = np.sum(np.where(np.isfinite(seen["slip"]), seen["slip"], 0.0)) * step
-        lifts = _peaks(seen["heights"])
-        columns[GAITS[name]] = [
-            float(seen["time"][-1]),
-            float((forward[-1] - forward[0]) / seen["time"][-1]),
-            1e3 * rms(seen["zmp"] - seen["zmp_plan"]),
-            1e3 * rms(seen["com"] - seen["com_plan"]),
-            float(np.degrees(rms((seen["joint_pos"] - seen["set_point"])[:, -12:]))),
-            100.0 * float(np.mean(seen["torque_share"] > 0.999)),
-            1e3 * slid / float(forward[-1] - forward[0]),
-            1e3 * float(np.median(lifts)),
-            100.0 * float(np.mean(~seen["is_loaded"].any(axis=1))),
-            float(np.degrees(np.abs(seen["rpy"][:, 0]).max())),
-            float(np.degrees(seen["rpy"][-1, 2])),
-        ]
+    gaits = {label: _numbers(inside(arrays, name)) for name, label in GAITS.items()}
+    columns: dict[str, list[object]] = {"measured": list(gaits[GAITS["good"]])}
+    for label, numbers in gaits.items():
+        columns[label] = list(numbers.values())
     return columns
+
+
+def _numbers(seen: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Return the rows of the table for a gait."""
+    rms = lambda x: np.sqrt(np.nanmean(np.square(x)))  # noqa: E731
+    time, distance = seen["time"], seen["forward"][-1] - seen["forward"][0]
+    slid = np.sum(np.where(np.isfinite(seen["slip"]), seen["slip"], 0.0)) * (time[1] - time[0])
+    rows = {
+        "upright, s": time[-1],
+        "forward, m/s": distance / time[-1],
+        "ZMP from its reference, lateral, rms mm": 1e3 * rms(seen["zmp"] - seen["zmp_plan"]),
+        "CoM from its plan, lateral, rms mm": 1e3 * rms(seen["com"] - seen["com_plan"]),
+        "leg joints from their set-points, rms deg": np.degrees(
+            rms((seen["joint_pos"] - seen["set_point"])[:, -12:])
+        ),
+        "time with a torque at its limit, %": 100.0 * np.mean(seen["torque_share"] > 0.999),
+        "loaded sole slides, mm for each m walked": 1e3 * slid / distance,
+        "swing sole's height, median of its maxima, mm": 1e3 * np.median(_peaks(seen["heights"])),
+        "both soles off the floor, % of the time": 100.0 * np.mean(~seen["is_loaded"].any(axis=1)),
+        "largest roll, deg": np.degrees(np.abs(seen["rpy"][:, 0]).max()),
+        "heading at the end, deg": np.degrees(seen["rpy"][-1, 2]),
+    }
+    return {name: float(value) for name, value in rows.items()}
 
 
 def _peaks(heights: np.ndarray) -> np.ndarray:

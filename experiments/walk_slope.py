@@ -238,9 +238,7 @@ def _error_ratio(arrays: Arrays) -> float:
 
 
 CLAIMS = (
-    Claim(
-        "falls on slopes up to 5 degrees", None, lambda arrays: float(_fell(arrays, GENTLE).sum()), high=0.0
-    ),
-    Claim("share of falls on all slopes", None, lambda arrays: float(_fell(arrays).mean()), high=0.01),
-    Claim("mean error of the speed, divided by the error of the shipped walk", None, _error_ratio, high=1.0),
+    Claim("falls on slopes up to 5 degrees", lambda arrays: float(_fell(arrays, GENTLE).sum()), high=0.0),
+    Claim("share of falls on all slopes", lambda arrays: float(_fell(arrays).mean()), high=0.01),
+    Claim("mean error of the speed, divided by the error of the shipped walk", _error_ratio, high=1.0),
 )

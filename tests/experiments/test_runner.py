@@ -249,7 +249,7 @@ def test_plot_and_check_use_the_latest_results(tiny, capsys):
     assert main(["plot", "tiny"]) == 0
     assert (folder / "curve.png").exists()
     assert main(["check", "tiny"]) == 0
-    tiny.CLAIMS = (registry.Claim("last reward", None, lambda arrays: arrays["reward"].mean(), low=1e3),)
+    tiny.CLAIMS = (registry.Claim("last reward", lambda arrays: arrays["reward"].mean(), low=1e3),)
     assert main(["check", "tiny"]) == 1
     assert "| NO |" in " ".join(capsys.readouterr().out.split())
 
