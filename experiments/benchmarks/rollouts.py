@@ -24,7 +24,7 @@ from jax.experimental import io_callback
 from creps_jax.simulation import c, mjx
 from creps_jax.simulation.models import load_nao
 from creps_jax.simulation.servos import read_servos
-from creps_jax.simulation.state import ControlStep, substep_shares
+from creps_jax.simulation.state import ControlStep, Physics, substep_shares
 from creps_jax.tasks import Task
 from creps_jax.tasks.walking import CONTROL_PERIOD, nao_walk, record_walk
 from creps_jax.tools.process import usable_cores
