@@ -1,7 +1,7 @@
 """Scale samples for the dual: units that neither overflow nor underflow, uncorrelated features, rounding.
 
 Units of rewards and features are powers of two, which round nothing. Differences of rewards that may be
-rounding errors are told from differences that carry information.
+rounding errors are separated from differences that carry information.
 """
 
 from typing import Any, NamedTuple
