@@ -514,6 +514,7 @@ PHYSICS = {
         samples=record(WeightedSamples(FIT["features"].good, FIT["theta"].good, FIT["weights"].good, None)),
         ridge=number(0.1, least=0.0),
         scale=optional(array(np.ones(2))),
+        constant=optional(array(np.array([1.0, 0.0]))),
     ),
     **{of.__name__: traced(of, use=lambda _: (), x=VECTOR) for of in OF_VECTORS},
 }

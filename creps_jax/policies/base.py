@@ -19,8 +19,6 @@ class WeightedSamples(NamedTuple):
     """Weights d, which sum to one; other values of a sample with weight zero are not used."""
     is_valid: Bool[Array, " n"]
     """Which samples are valid: relative entropies are averaged over their contexts."""
-    constant: Float[Array, " p"] | None = None
-    """Coefficients whose sum with the features is one, see `FeatureMap.constant`; None if not stated."""
 
 
 class Policy(NamedTuple):

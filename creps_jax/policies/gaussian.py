@@ -4,6 +4,7 @@ Functions take the features of one context; `jax.vmap` them over a batch.
 """
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -217,6 +218,7 @@ def linear_gaussian(
     Args:
         features: Features varphi(s) that the mean is linear in.
         m_step: How it is fitted to weighted samples, `(old policy, samples, *, ridge, scale) -> new policy`.
+            If it has an argument `constant`, it also gets the constant of the features.
         ridge: Penalty on the coefficients, relative to the square of each feature's scale.
 
     Returns:
@@ -252,12 +254,13 @@ class _Fit:
     constant: tuple[float, ...] | None
 
     def __call__(self, policy: LinearGaussian, samples: WeightedSamples) -> LinearGaussian:
-        scale, constant = (
-            None if numbers is None else jnp.asarray(numbers, samples.theta.dtype)
-            for numbers in (self.scale, self.constant)
-        )
-        samples = samples._replace(constant=constant)
-        fitted = self.m_step(policy, samples, ridge=self.ridge, scale=scale)
+        settings = {
+            name: None if numbers is None else jnp.asarray(numbers, samples.theta.dtype)
+            for name, numbers in (("scale", self.scale), ("constant", self.constant))
+        }
+        if "constant" not in inspect.signature(self.m_step).parameters:
+            del settings["constant"]
+        fitted = self.m_step(policy, samples, ridge=self.ridge, **settings)
         checks.instance("what m_step returns", fitted, LinearGaussian)
         for field, values in policy._asdict().items():
             checks.array(f"{field} of what m_step returns", getattr(fitted, field), values.shape)

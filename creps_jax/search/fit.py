@@ -30,7 +30,8 @@ _NUM_TRIALS, _NUM_REFINEMENTS = 32, 4
 
 
 MStep = Callable[..., LinearGaussian]
-"""`(old policy, samples, *, ridge, scale) -> new policy`; see `fit_weighted_ml` for the settings."""
+"""`(old policy, samples, *, ridge, scale, constant) -> new policy`; see `fit_weighted_ml` for the settings.
+An M-step may lack `constant`."""
 
 
 @checks.arguments
@@ -40,12 +41,13 @@ def weighted_ml(
     *,
     ridge: ScalarLike,
     scale: Float[Array, " p"] | None = None,
+    constant: Float[Array, " p"] | None = None,
 ) -> LinearGaussian:
     """Fit by weighted maximum likelihood without bounds: `fit_weighted_ml`, starting from the old policy.
 
     Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
     """
-    features, theta, weights, _, constant = samples
+    features, theta, weights, _ = samples
     return fit_weighted_ml(
         features, theta, weights, ridge=ridge, scale=scale, start=policy.coef, constant=constant
     )
@@ -127,11 +129,12 @@ class BoundedML:
         *,
         ridge: ScalarLike,
         scale: Float[Array, " p"] | None = None,
+        constant: Float[Array, " p"] | None = None,
     ) -> LinearGaussian:
         """Fit within the bounds; see `fit_weighted_ml` for the settings."""
         checks.instance("policy", policy, LinearGaussian)
         checks.instance("samples", samples, WeightedSamples)
-        features, theta, weights, _, constant = samples
+        features, theta, weights, _ = samples
         fit = regress(
             features, theta, weights, ridge=ridge, scale=scale, start=policy.coef, constant=constant
         )

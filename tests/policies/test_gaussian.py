@@ -24,7 +24,7 @@ from creps_jax.policies.gaussian import (
     sample,
     start_policy,
 )
-from creps_jax.search.fit import weighted_ml
+from creps_jax.search.fit import bounded_ml, weighted_ml
 
 COEF = np.array([[1.0, -2.0, 0.5], [3.0, 0.0, -1.0]])
 ROOT = np.array([[0.5, 0.0, 0.0], [0.2, 1.0, 0.0], [-0.3, 0.4, 2.0]])
@@ -305,12 +305,27 @@ def test_the_constant_that_features_state_is_found_in_samples_too(features, num,
     np.testing.assert_allclose(found[1], stated[1], rtol=1e-6)
 
 
+def test_an_m_step_need_not_take_the_constant():
+    given = []
+
+    def plain(policy, samples, *, ridge, scale):
+        given.append((ridge, scale))
+        return policy
+
+    features = linear_features(1)
+    start = start_policy(features, 2)
+    samples = WeightedSamples(jnp.ones((3, 2)), jnp.ones((3, 2)), jnp.full(3, 1 / 3), jnp.ones(3, bool))
+    assert linear_gaussian(features, m_step=plain, ridge=0.1).fit(start, samples) is start
+    assert given == [(0.1, None)]
+
+
+@pytest.mark.parametrize("m_step", [weighted_ml, bounded_ml(mean_kl_bound=1e3)], ids=["plain", "bounded"])
 @pytest.mark.parametrize("seen", [0.0, 0.3])
-def test_a_policy_of_one_context_does_not_extrapolate(seen):
+def test_a_policy_of_one_context_does_not_extrapolate(seen, m_step):
     """At one context all features are constant: only `FeatureMap.constant` tells which one always is."""
     features = linear_features(1)
     theta = jnp.float32(np.random.default_rng(0).normal(size=(10, 2)) + 5.0)
-    kind = linear_gaussian(features, m_step=weighted_ml)
+    kind = linear_gaussian(features, m_step=m_step)
     start = start_policy(features, 2)
     rows = features(jnp.full((10, 1), seen))
     fitted = kind.fit(start, WeightedSamples(rows, theta, jnp.full(10, 0.1), jnp.ones(10, bool)))
