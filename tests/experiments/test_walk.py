@@ -221,7 +221,7 @@ def test_settings_within_settings_are_options(bench):
 
 @pytest.mark.parametrize("num_centers", [None, 4, (4, 3)])
 def test_the_numbers_of_centres_come_back_from_a_manifest(num_centers):
-    settings = walk_slope.Settings(features=walk.Features("rbf", num_centers))
+    settings = walk_slope.Settings(features=Features("rbf", num_centers))
     assert walk_slope.Settings(**dataclasses.asdict(settings)) == settings
     manifest = json.loads(json.dumps(dataclasses.asdict(settings)))
     assert read(walk_slope.Settings, manifest, "settings") == settings
