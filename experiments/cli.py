@@ -115,7 +115,8 @@ def main(arguments: Sequence[str]) -> int:
         return 0
     if arguments[0] in _ELSEWHERE:
         there = _ELSEWHERE[arguments[0]]
-        return answer(lambda: _refuse(f"{arguments[0]} is a command of `python -m creps_jax.tools {there}`"))
+        why = f"{arguments[0]} is not a command here; use `python -m creps_jax.tools {there}`"
+        return answer(lambda: _refuse(why))
     # The options depend on the experiment.
     if arguments[0] == "run" and len(arguments) > 1 and not arguments[1].startswith("-"):
         return answer(lambda: _run(arguments[1], arguments[2:]))
@@ -140,21 +141,36 @@ def _list(_: List) -> int:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    if name == registry.ALL:
-        return _run_all(arguments)
-    registry.check_name(name)
+    if name != registry.ALL:
+        registry.check_name(name)
     if any(word == "--speed" or word.startswith("--speed=") for word in arguments):
         raise UserError(
             "--speed is not a setting of an experiment; to show a walk: "
             "`python -m creps_jax.tools play --speed M/S`"
         )
     early = _early_options(arguments)
-    if early.preset is not None:
+    if early.distributed and early.out is None:
+        raise UserError("processes that share a run need --out, a folder that all of them see")
+    if name == registry.ALL:
+        _check_all(early)
+    elif early.preset is not None:
         registry.check_preset(name, early.preset)
     if early.distributed:
-        if early.out is None:
-            raise UserError("processes that share a run need --out, a folder that all of them see")
         join_processes()
+    if name != registry.ALL:
+        return _run_one(name, arguments)
+    for each in registry.FIGURES:
+        # The last of two equal options is used.
+        out = [] if early.out is None else ["--out", str(early.out / each)]
+        code = _run_one(each, [*arguments, *out])
+        if code:
+            return code
+    return 0
+
+
+def _run_one(name: str, arguments: list[str]) -> int:
+    """Run an experiment; processes that share the run have been joined."""
+    early = _early_options(arguments)
     import_mjx_quietly()
     from rich.console import Console
 
@@ -218,8 +234,8 @@ def _options_and_settings(
     return Run(name, **options), parsed.settings
 
 
-def _run_all(arguments: list[str]) -> int:
-    early = _early_options(arguments)
+def _check_all(early: argparse.Namespace) -> None:
+    """Check the options of a run of all figures."""
     if early.resume or early.config is not None:
         raise UserError("--resume and --config go with one experiment, not with all")
     for name in registry.FIGURES:
@@ -227,13 +243,6 @@ def _run_all(arguments: list[str]) -> int:
             registry.check_preset(name, early.preset)
         if early.out is not None and (early.out / name).exists():
             raise UserError(f"{early.out / name} exists already, name another folder")
-    for name in registry.FIGURES:
-        # The last of two equal options is used.
-        out = [] if early.out is None else ["--out", str(early.out / name)]
-        code = _run(name, [*arguments, *out])
-        if code:
-            return code
-    return 0
 
 
 def _plot(command: Plot) -> int:

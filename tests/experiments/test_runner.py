@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from creps_jax import files
 from creps_jax.errors import UserError
 from creps_jax.policies.feature_settings import Features
 from creps_jax.tools import folder_lock, results
-from experiments import claims, learning, registry, runner, walk
+from experiments import claims, cli, learning, registry, runner, walk
 from experiments.cli import main
 from experiments.request import Request, default_settings, folder_to_resume
 
@@ -287,3 +288,16 @@ def test_all_runs_every_figure_in_a_folder_of_its_own(tiny, monkeypatch):
     assert main(["run", "all", "--iterations", "2", "--out", "here"]) == 0
     assert (Path("here") / "tiny" / "arrays.npz").exists()
     assert main(["run", "all", "--resume"]) == 2
+
+
+def test_processes_that_share_a_run_of_all_figures_join_once(tiny, monkeypatch, capsys):
+    joined = []
+    monkeypatch.setattr(registry, "FIGURES", ("tiny", "same"))
+    monkeypatch.setitem(registry.EXPERIMENTS, "same", registry.EXPERIMENTS["tiny"])
+    monkeypatch.setitem(sys.modules, "experiments.same", sys.modules["experiments.tiny"])
+    monkeypatch.setattr(cli, "join_processes", lambda: joined.append(1))
+    assert main(["run", "all", "--distributed", "--iterations", "2"]) == 2
+    assert "processes that share a run need --out" in capsys.readouterr().err and not joined
+    assert main(["run", "all", "--distributed", "--iterations", "2", "--out", "here"]) == 0
+    assert joined == [1]
+    assert {path.parent.name for path in Path("here").glob("*/arrays.npz")} == {"tiny", "same"}

@@ -115,8 +115,8 @@ def test_an_interrupt_within_a_callback_is_not_lost(monkeypatch):
             "error: --speed is not a setting of an experiment",
         ),
         (["run", "--preset", "quick", "walk"], 2, "", "error: the name of the experiment comes first"),
-        (["video"], 2, "", "error: video is a command of `python -m creps_jax.tools play`"),
-        (["session", "ask", "arm"], 2, "", "error: session is a command of `python -m creps_jax.tools"),
+        (["video"], 2, "", "error: video is not a command here; use `python -m creps_jax.tools play`"),
+        (["session", "ask", "arm"], 2, "", "error: session is not a command here; use `"),
     ],
 )
 def test_help_and_mistakes_are_answered_without_starting_jax(tmp_path, arguments, code, out, error):
