@@ -24,9 +24,9 @@ import numpy as np
 import tyro
 
 from creps_jax.errors import UserError
-from creps_jax.rollouts import roll_out
-from creps_jax.simulation.state import ControlStep, RobotState
-from creps_jax.tasks.walking import CONTROL_PERIOD, Physics
+from creps_jax.rollouts import compiled_roll_out
+from creps_jax.simulation.state import ControlStep, Physics, RobotState
+from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tools import tables
 from creps_jax.tools.command_line import answer
 from creps_jax.tools.process import usable_cores
@@ -184,7 +184,7 @@ def _compile(case: Case, physics: Physics) -> tuple[Any, Callable[[], Any]]:
     task, contexts, thetas = walking_batch(case.size, case.duration, physics)
     devices = tuple(jax.devices()[: case.devices])
     batch = (jax.random.key(0), contexts, thetas)
-    compiled = roll_out.lower(task, devices, *batch).compile()
+    compiled = compiled_roll_out(task, devices).lower(*batch).compile()
     batch = jax.device_put(batch, compiled.input_shardings[0])
     return compiled, lambda: jax.block_until_ready(compiled(*batch))
 

@@ -76,6 +76,13 @@ def test_what_was_measured_is_printed_whatever_comes(monkeypatch, capsys, end):
     assert [[cell.strip() for cell in line] for line in lines[2:]] == rows
 
 
+def test_the_rollouts_of_a_case_are_compiled_and_run():
+    compiled, run = scaling._compile(Case("mjx", 1, 3, 0.1), scaling._no_physics)
+    outcomes, is_failed = run()
+    assert outcomes.reward.shape == (3,) and not is_failed.any()
+    assert compiled.memory_analysis().output_size_in_bytes > 0
+
+
 def test_the_largest_memory_is_in_mebibytes():
     # A process with jax; bytes or KiB would be far off.
     assert 50 < scaling.peak_memory() < 50_000
