@@ -27,14 +27,14 @@ class _Argument(NamedTuple):
 
     Attributes:
         name: as users write it, or, of a positional argument, as the help shows it.
-        kind: type of a value; bool is a flag, which has no value.
+        kinds: types that a value may have; bool is a flag, which has no value.
         is_optional: whether "None" is a value, too.
         is_list: whether it takes any number of values.
         is_required: whether it has no default.
     """
 
     name: str
-    kind: type
+    kinds: tuple[type, ...]
     is_optional: bool
     is_list: bool
     is_required: bool
@@ -42,17 +42,22 @@ class _Argument(NamedTuple):
     @property
     def expected(self) -> str:
         """What a value must be."""
-        return _NOUNS.get(self.kind, self.kind.__name__)
+        return " or ".join(_NOUNS.get(kind, kind.__name__) for kind in self.kinds)
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether it has no value."""
+        return self.kinds == (bool,)
 
     def accepts(self, value: str) -> bool:
         """Return whether a value has the right type."""
         if self.is_optional and value == "None":
             return True
-        try:
-            self.kind(value)
-        except ValueError:
-            return False
-        return True
+        for kind in self.kinds:
+            with contextlib.suppress(ValueError):
+                kind(value)
+                return True
+        return False
 
 
 def parse(kind: Any, arguments: Sequence[str], *, prog: str, default: Any = None) -> Any:
@@ -123,9 +128,9 @@ def _mistake_in_options(arguments: Sequence[_Argument], words: list[str]) -> str
             if argument is None:
                 return f"unknown option {name}{_nearest(name, options)}"
             values = [value] if equals else _take_values(argument, words)
-            if argument.kind is bool and equals:
+            if argument.is_flag and equals:
                 return f"{argument.name} takes no value, got {value!r}"
-            if not values and argument.kind is not bool and not argument.is_list:
+            if not (values or argument.is_flag or argument.is_list):
                 return f"{argument.name} must be {argument.expected}, got no value"
         found.add(argument.name)
         for value in values:
@@ -150,7 +155,7 @@ def _is_number(word: str) -> bool:
 def _take_values(argument: _Argument, words: list[str]) -> list[str]:
     """Remove the values of an option from the words that follow it, and return them."""
     values: list[str] = []
-    most = 0 if argument.kind is bool else math.inf if argument.is_list else 1
+    most = 0 if argument.is_flag else math.inf if argument.is_list else 1
     while len(values) < most and words and not _is_option(words[0]):
         values.append(words.pop(0))
     return values
@@ -174,15 +179,18 @@ def _arguments(kind: Any, prefix: str = "") -> list[_Argument]:
         if dataclasses.is_dataclass(plain):
             arguments += _arguments(plain, f"{prefix}{name}." if name else prefix)
             continue
-        is_optional = isinstance(plain, types.UnionType)
-        value = typing.get_args(plain)[0] if is_optional else plain
-        is_list = typing.get_origin(value) is tuple
+        members = typing.get_args(plain) if isinstance(plain, types.UnionType) else (plain,)
+        values = [each for each in members if each is not types.NoneType]
+        is_list = any(typing.get_origin(each) is tuple for each in values)
+        kinds = dict.fromkeys(
+            typing.get_args(each)[0] if typing.get_origin(each) is tuple else each for each in values
+        )
         shown = f"--{prefix}{name}".replace("_", "-")
         if tyro.conf.Positional in marks:
             shown = next(mark.metavar for mark in marks if getattr(mark, "metavar", None))
         is_required = field.default is field.default_factory is dataclasses.MISSING
-        value = typing.get_args(value)[0] if is_list else value
-        arguments.append(_Argument(shown, value, is_optional, is_list, is_required))
+        is_optional = len(values) < len(members)
+        arguments.append(_Argument(shown, tuple(kinds), is_optional, is_list, is_required))
     return arguments
 
 

@@ -16,6 +16,8 @@ from experiments import cli as experiments
 class Inner:
     kind: str = "rbf"
     num_centers: int = 5
+    widths: int | tuple[int, ...] | None = None
+    gain: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +71,10 @@ def test_what_is_right_is_parsed():
         ("learn x --kl-bound", "--kl-bound must be a number, got no value"),
         ("learn x --kl-bound --resume", "--kl-bound must be a number, got no value"),
         ("learn x --inner.num-centers 2.5", "--inner.num-centers must be a whole number, got '2.5'"),
+        ("learn x --inner.widths 5 3 --kl-bond 1", "unknown option --kl-bond, did you mean --kl-bound? See"),
+        ("learn x --inner.widths None --kl-bond 1", "unknown option --kl-bond, did you mean --kl-bound? See"),
+        ("learn x --inner.widths 5 a", "--inner.widths must be a whole number, got 'a'; see"),
+        ("learn x --inner.gain a", "--inner.gain must be a number, got 'a'; see"),
         ("learn x --sizes 1 a", "--sizes must be a whole number, got 'a'"),
         ("learn x --resume=1", "--resume takes no value, got '1'"),
         ("learn x y", "unexpected argument 'y'"),
