@@ -135,7 +135,7 @@ def make_setup(
         raise ValueError(f"duration must be {CONTROL_PERIOD} to {_LONGEST:g} s, got {duration}")
     check_numbers("noise", noise, least=0.0)
     check_numbers("balance", balance)
-    check_conditions(conditions, duration)
+    check_conditions(conditions, duration, CONTROL_PERIOD)
     checks.function("physics", physics, "(model, number of steps) -> control step")
     used = load_nao(robot) if model is None else model
     check_model(used, robot)
@@ -233,7 +233,8 @@ def _count_substeps(model: mujoco.MjModel) -> int:
     ratio = CONTROL_PERIOD / model.opt.timestep
     if abs(ratio - round(ratio)) > 1e-6:
         raise ValueError(
-            f"the control step of {CONTROL_PERIOD} s is no multiple of the time step {model.opt.timestep} s"
+            f"time step of the model must divide the control step of {CONTROL_PERIOD} s, "
+            f"got {model.opt.timestep} s"
         )
     return round(ratio)
 

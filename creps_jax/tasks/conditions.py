@@ -147,12 +147,18 @@ def push(low: float, high: float, *, time: float = 3.0) -> Condition:
     return _checked(Condition("push", "m/s", low, high, apply, begins=time))
 
 
-def check_conditions(conditions: Sequence[Condition], duration: float) -> None:
-    """Check that a walk of this duration, in s, can have these conditions.
+def check_conditions(conditions: Sequence[Condition], duration: float, period: float) -> None:
+    """Check that a walk of this duration, in control steps of this period, can have these conditions.
+
+    Args:
+        conditions: The conditions.
+        duration: Length of the walk, s.
+        period: Duration of a control step, s. A walk is as long as the nearest number of control steps, and
+            a condition begins with the nearest one.
 
     Raises:
         ValueError: If two have the same name (the second would replace the first), or one begins after the
-            end.
+            last control step.
     """
     if not isinstance(conditions, Sequence) or not all(isinstance(each, Condition) for each in conditions):
         raise ValueError(f"conditions must be a list of Condition, got {checks.shown(conditions)}")
@@ -160,9 +166,10 @@ def check_conditions(conditions: Sequence[Condition], duration: float) -> None:
     if len(set(names)) < len(names):
         raise ValueError(f"every condition must have a name of its own, got {', '.join(names)}")
     for condition in conditions:
-        if not condition.begins < duration:
+        if not round(condition.begins / period) < round(duration / period):
             raise ValueError(
-                f"the {condition.name} must begin before the end at {duration} s, got {condition.begins} s"
+                f"the {condition.name} must begin before the end at {duration} s, both rounded to control "
+                f"steps of {period} s, got {condition.begins} s"
             )
 
 

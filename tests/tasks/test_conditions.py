@@ -104,6 +104,15 @@ def test_a_push_comes_once_at_its_time(drift):
     np.testing.assert_allclose(np.diff(y[4:]), 0.3 * 0.02, rtol=1e-4)
 
 
+def test_a_push_in_the_last_control_step_is_felt():
+    settings = {"duration": 0.2, "noise": STILL, "physics": drifting}
+    last = push(-0.5, 0.5, time=0.189)
+    walk = record_walk(
+        jax.random.key(0), jnp.array(MIDDLE), values=jnp.array([0.3]), conditions=(last,), **settings
+    )
+    np.testing.assert_allclose(np.diff(walk.qpos[:, 1]), [*[0.0] * 8, 0.3 * 0.02], rtol=1e-4)
+
+
 def test_the_physics_are_told_the_world(drift):
     height = drift(0.0, 2.0, 0.0).qpos[:, 2]
     np.testing.assert_allclose(np.diff(height), -0.002, rtol=1e-3)
@@ -167,7 +176,14 @@ def test_conditions_at_rest_change_no_walk_and_others_do():
         (lambda: friction(0.0, 1.0), "friction must be above 0, got 0.0 and 1.0"),
         (lambda: push(-1.0, 1.0, time=0.0), "time must be finite and above 0, got 0.0"),
         (lambda: nao_walk(conditions=(slope(0.0, 1.0), slope(0.0, 2.0))), "of its own, got slope, slope"),
-        (lambda: nao_walk(duration=3.0, conditions=(push(0.0, 1.0),)), "before the end at 3.0 s, got 3.0 s"),
+        (
+            lambda: nao_walk(duration=3.0, conditions=(push(0.0, 1.0),)),
+            "the push must begin before the end at 3.0 s, both rounded to control steps of 0.02 s, got 3.0 s",
+        ),
+        (
+            lambda: nao_walk(conditions=(push(0.0, 1.0, time=7.995),)),
+            "before the end at 8.0 s, .* got 7.995 s",
+        ),
         (
             lambda: record_walk(
                 jax.random.key(0), jnp.array(MIDDLE), conditions=(slope(0.0, 1.0),), values=jnp.zeros(2)
