@@ -12,12 +12,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from creps_jax.errors import UserError
-from creps_jax.files import policies_folder
 from creps_jax.numerics.rotations import quat_to_rpy
 from creps_jax.robots.nao_geometry import JOINT_NAMES
-from creps_jax.tasks.walking import WalkNoise, record_walk
+from creps_jax.tasks.closed_loop import WalkNoise
+from creps_jax.tasks.walking import record_walk
 from creps_jax.tools import plots
-from creps_jax.tools.play import balance_of, load_walking_policy
+from creps_jax.tools.play import balance_of, load_walking_policy, shipped_policy
 from creps_jax.walking.engine import plan_walk
 from creps_jax.walking.params import params_from_theta
 from creps_jax.walking.posture import Balance
@@ -63,7 +63,7 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         UserError: if no seed among the candidates makes the bad gait fall and the good one not.
     """
     del session
-    saved = load_walking_policy(policies_folder() / "walk.npz")
+    saved = load_walking_policy(shipped_policy())
     theta = jnp.asarray(saved.theta(settings.speed))
     balances = {"good": balance_of(saved), "bad": balance_of(saved)._replace(placement_gain=0.0)}
     walkers = {name: _Walker(settings, balance) for name, balance in balances.items()}

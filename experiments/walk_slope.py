@@ -14,13 +14,12 @@ from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid
 from creps_jax.errors import UserError
-from creps_jax.files import policies_folder
+from creps_jax.policies.bounds import range_text
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.gaussian import LinearGaussian
-from creps_jax.policies.learned import load
 from creps_jax.tasks.conditions import Condition, slope
 from creps_jax.tools import plots
-from creps_jax.tools.play import record, save_film
+from creps_jax.tools.play import load_walking_policy, record, save_film, shipped_policy
 from creps_jax.tools.plots import Map
 from creps_jax.walking.params import PARAM_UNITS
 from experiments import walk
@@ -133,17 +132,24 @@ def walk_everywhere(settings: Settings, key: jax.Array, policy: LinearGaussian) 
 def warm_start(settings: Settings) -> LinearGaussian:
     """Return the first policy: the features' best fit of a policy of the speed, the same on every slope.
 
-    It fits `start_policy`, by default the shipped policy.
+    It fits `start_policy`, by default the shipped policy of the robot.
 
     Raises:
-        UserError: if that policy has other bounds.
+        UserError: if that policy is of another robot, or has other bounds or a smaller range of speeds.
     """
-    path = Path(settings.start_policy or policies_folder() / "walk.npz")
-    shipped = load(path)
+    path = Path(settings.start_policy or shipped_policy(settings.robot))
+    shipped = load_walking_policy(path, settings.robot)
     space = shipped.parameters
     if (space.constraint, space.low, space.high) != (settings.constraint, *settings.box()):
         wanted = settings.bounds or settings.robot
         raise UserError(f"{path} has other bounds than {settings.constraint} within {wanted}")
+    (low, *_), (high, *_) = settings.context_range()
+    slowest, fastest = shipped.contexts.low[0], shipped.contexts.high[0]
+    if not slowest <= low < high <= fastest:
+        known = range_text(slowest, fastest, "m/s")
+        raise UserError(
+            f"low and high must be within the speeds of {path}, {known}, got {low:g} and {high:g}"
+        )
     contexts = context_grid(*settings.context_range(), _FITTED)
     features = jax.vmap(settings.features.make(*settings.context_range()).apply)(contexts)
     wanted = np.stack([shipped.mean(float(speed)) for speed, _ in contexts])

@@ -107,6 +107,20 @@ def test_a_first_policy_of_other_bounds_is_refused(settings):
         walk_slope.warm_start(dataclasses.replace(settings, bounds="paper"))
 
 
+def test_the_first_policy_is_the_shipped_one_of_the_robot(settings):
+    h25 = dataclasses.replace(settings, robot="nao_h25", low=0.1, high=0.3)
+    start = walk_learning.as_learned(h25, walk_slope.warm_start(h25))
+    shipped = load(policies_folder("nao_h25") / "walk.npz")
+    width = np.subtract(shipped.parameters.high, shipped.parameters.low)
+    np.testing.assert_array_less(np.abs(start.theta(0.2, 5.0) - shipped.theta(0.2)), 0.1 * width)
+
+
+def test_speeds_that_the_first_policy_does_not_know_are_refused(settings):
+    message = r"low and high must be within the speeds of .*walk\.npz, 0\.05 to 0\.3 m/s, got 0\.1 and 0\.4"
+    with pytest.raises(UserError, match=message):
+        walk_slope.warm_start(dataclasses.replace(settings, robot="nao_h25"))
+
+
 def test_films_show_each_walk_on_its_slope(settings, monkeypatch):
     def recorded(key, theta, *, values, duration, balance, physics, conditions, robot):
         del key, theta, balance, physics, robot
