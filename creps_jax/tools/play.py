@@ -15,8 +15,9 @@ from creps_jax.policies.learned import Learned, load
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.simulation import c
 from creps_jax.simulation.models import model_path
+from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tasks.conditions import slope
-from creps_jax.tasks.walking import CONTROL_PERIOD, record_walk
+from creps_jax.tasks.walking import record_walk
 from creps_jax.tools import results
 from creps_jax.tools.robots import find_robot
 from creps_jax.tools.video import Clip, VideoError, write_video

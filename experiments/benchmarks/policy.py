@@ -18,7 +18,8 @@ import tyro
 
 from creps_jax.policies.learned import Learned
 from creps_jax.tasks import Task
-from creps_jax.tasks.walking import WalkNoise, nao_walk
+from creps_jax.tasks.closed_loop import WalkNoise
+from creps_jax.tasks.walking import nao_walk
 from creps_jax.tools import tables
 from creps_jax.tools.command_line import answer
 from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy

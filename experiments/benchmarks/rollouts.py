@@ -26,7 +26,8 @@ from creps_jax.simulation.models import load_nao
 from creps_jax.simulation.servos import read_servos
 from creps_jax.simulation.state import ControlStep, Physics, substep_shares
 from creps_jax.tasks import Task
-from creps_jax.tasks.walking import CONTROL_PERIOD, nao_walk, record_walk
+from creps_jax.tasks.closed_loop import CONTROL_PERIOD
+from creps_jax.tasks.walking import nao_walk, record_walk
 from creps_jax.tools.process import usable_cores
 from creps_jax.training import evaluate
 from experiments.walking.settings import SETTINGS

@@ -15,7 +15,8 @@ from creps_jax.policies.space import Space, sigmoid_gate
 from creps_jax.search.creps import Creps, CrepsState, creps
 from creps_jax.search.fit import fit_within
 from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constrained
-from creps_jax.tasks.walking import WalkNoise, nao_walk
+from creps_jax.tasks.closed_loop import WalkNoise
+from creps_jax.tasks.walking import nao_walk
 from creps_jax.tools.play import START_UP, load_walking_policy
 from creps_jax.training import evaluate
 from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS
@@ -23,7 +24,7 @@ from experiments.learning import Log, Plan, Session, learn, trial_keys
 from experiments.walking.settings import PHYSICS, SAMPLERS, TIMESTEP, Settings
 
 PENALTY_SIZE = 1000.0
-"""Factor of the penalty of the reward that limits parameters to their bounds."""
+"""Penalty of the reward for parameters outside of their bounds, see `penalised`."""
 
 
 def make_plan(settings: Settings) -> Plan:
@@ -102,7 +103,7 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
 
 
 def make_algorithm(settings: Settings) -> Creps:
-    """Set up contextual REPS; the RBFs are policy and baseline features."""
+    """Set up contextual REPS with the features of the settings and their baseline features."""
     features = settings.features.make(*settings.context_range())
     baseline = settings.features.make_baseline(*settings.context_range())
     return creps(
