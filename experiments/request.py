@@ -104,9 +104,7 @@ def started(experiment: registry.Experiment, request: Request) -> tuple[Any, Pat
     if folder is None:
         folder = results.new_folder(results.default_root() / request.name, f"{results.stamp()}-{preset}")
     elif (folder / results.MANIFEST).exists():
-        raise UserError(
-            f"{folder} holds a run already: add --resume to go on with it, or name another folder"
-        )
+        raise UserError(f"{folder} holds a run already: add --resume to resume it, or name another folder")
     elif folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file, expected a folder")
     elif folder.exists() and (foreign := [p.name for p in folder.iterdir() if not p.name.startswith(".")]):
@@ -186,8 +184,4 @@ def _check_counts(settings: Any) -> None:
 def identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
     """Return what identifies the checkpoints of a run: everything except the number of iterations."""
     same = {key: value for key, value in dataclasses.asdict(settings).items() if key != "iterations"}
-    # Older checkpoints have neither of these settings.
-    for setting, default in (("robot", registry.PAPER_ROBOT), ("start_policy", None)):
-        if setting in same and same[setting] == default:
-            del same[setting]
     return {"experiment": name, "seed": seed, "settings": same}

@@ -78,7 +78,7 @@ def _run(
             finish(settings, arrays, folder, say)
     except KeyboardInterrupt:
         update("interrupted")
-        say(f"stopped; to go on: python -m experiments run {name} --resume --out {folder}")
+        say(f"stopped; to resume: python -m experiments run {name} --resume --out {folder}")
         raise
     except Exception as error:
         update("failed")

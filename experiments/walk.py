@@ -8,8 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from creps_jax import files
-from creps_jax.errors import UserError
-from creps_jax.policies.bounds import SIGMOID
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned
 from creps_jax.tools import plots, tables
@@ -31,8 +29,6 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         (trials, n, d), the evaluation (trials, n, seeds) and, for several trials, `trial_reward` (trials,):
         the mean reward at the same speeds in the noise of learning, by which a trial is chosen.
     """
-    if settings.constraint != SIGMOID:
-        raise UserError(f"a policy is only kept with the constraint sigmoid, got {settings.constraint!r}")
     evaluate_key, learn_key = jax.random.split(key)
     states, log = learning.learn_to_walk(settings, learn_key, session=session, name="walk")
     policy = states.policy

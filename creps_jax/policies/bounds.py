@@ -7,10 +7,12 @@ from creps_jax.errors import UserError
 
 __all__ = [
     "CLIP",
-    "CONSTRAINTS",
     "NONE",
     "PENALTY",
+    "RUN_CONSTRAINTS",
+    "SESSION_CONSTRAINTS",
     "SIGMOID",
+    "SPACE_CONSTRAINTS",
     "check_constraint",
     "range_error",
     "range_text",
@@ -24,12 +26,16 @@ NONE = "none"
 """Leave the numbers as they are."""
 PENALTY = "penalty"
 """In learning, subtract a penalty from the reward outside of the bounds; learned policies are clipped."""
-CONSTRAINTS = (SIGMOID, CLIP, NONE)
-"""How the numbers that a policy draws become parameters within their bounds."""
+SPACE_CONSTRAINTS = (SIGMOID, CLIP, NONE)
+"""How the numbers that a policy draws become parameters, see `Space`."""
+SESSION_CONSTRAINTS = (SIGMOID, CLIP)
+"""The constraints of a session with a real robot, which needs all parameters inside their bounds."""
+RUN_CONSTRAINTS = (SIGMOID, PENALTY)
+"""The constraints of learning in simulation."""
 
 
-def check_constraint(constraint: Any, known: Sequence[str] = CONSTRAINTS) -> None:
-    """Refuse a constraint that is not known.
+def check_constraint(constraint: Any, known: Sequence[str] = SPACE_CONSTRAINTS) -> None:
+    """Check that a constraint is one of the known ones.
 
     Raises:
         UserError: If it is not.

@@ -11,7 +11,7 @@ import numpy as np
 
 from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.errors import UserError
-from creps_jax.policies.bounds import PENALTY, SIGMOID
+from creps_jax.policies.bounds import RUN_CONSTRAINTS, SIGMOID
 from creps_jax.policies.feature_settings import Features
 from creps_jax.simulation import c, mjx
 from creps_jax.simulation.state import ControlStep
@@ -26,7 +26,6 @@ BOUNDS = {
     "paper": PAPER_BOUNDS,
 }
 SAMPLERS = {"gaussian": partial(gaussian_contexts, clip=True), "uniform": uniform_contexts}
-CONSTRAINTS = (SIGMOID, PENALTY)
 NUM_SPEEDS = 11
 TIMESTEP = 0.004
 """Time step of the physics, s."""
@@ -52,7 +51,7 @@ class Settings:
     and RBF width of the scripts that the paper's author published; DEVIATIONS.md lists the differences.
 
     Attributes:
-        robot: name of the robot in ROBOTS.
+        robot: robot that walks: nao or nao_h25.
         iterations: iterations of learning.
         trials: trials, all learned at once.
         samples: new samples of each trial in an iteration.
@@ -66,9 +65,9 @@ class Settings:
         significance: p-value above which the covariance is not updated, see `creps_jax.creps`; None is the
             paper's update, which has no such test.
         features: kind, number and width of the policy's features.
-        bounds: bounds of the parameters, a name in BOUNDS; None is the bounds of the robot.
-        constraint: limits the parameters to their bounds, a name in CONSTRAINTS: by a sigmoid, or by a
-            penalty of the reward.
+        bounds: bounds of the parameters: nao, nao_h25, author or paper; None is the bounds of the robot.
+        constraint: limit on the parameters at their bounds: sigmoid or penalty. A penalty is subtracted from
+            the reward outside of the bounds.
         start_mean: mean of the first policy before squashing; 0 is the middle of the bounds.
         start_std: its standard deviation before squashing. With a penalty the first policy is the same to
             first order.
@@ -81,14 +80,14 @@ class Settings:
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
         placement_gain: shift of the landing foot towards the side of the tilt, see `Balance`; 0 is the
             paper's engine.
-        sampler: distribution of the contexts in learning, a name in SAMPLERS.
+        sampler: distribution of the contexts in learning: gaussian or uniform.
         margin: distance beyond both ends of the range in which contexts are also drawn in learning, m/s;
             without samples on both sides the ends are learned less well than the middle.
         learning_noise: noise in learning, as a factor of the noise in the evaluation: a policy that is
             learned in more noise falls less.
         eval_seeds: new episodes at each speed of the table.
-        physics: simulation of the robot, a name in PHYSICS: MJX on the device, C MuJoCo on the host's cores,
-            or the faster of them.
+        physics: simulation of the robot: auto, mjx or c. MJX runs on the device, C MuJoCo on the cores of the
+            host; auto is the faster of them.
     """
 
     robot: str = "nao"
@@ -125,7 +124,7 @@ class Settings:
         if isinstance(self.features, Mapping):
             object.__setattr__(self, "features", Features(**self.features))
         find_robot(self.robot)
-        choices = {"constraint": CONSTRAINTS, "sampler": SAMPLERS, "physics": PHYSICS}
+        choices = {"constraint": RUN_CONSTRAINTS, "sampler": SAMPLERS, "physics": PHYSICS}
         if self.bounds is not None:
             choices["bounds"] = BOUNDS
         for name, known in choices.items():

@@ -13,6 +13,7 @@ import pytest
 
 from creps_jax import files
 from creps_jax.errors import UserError
+from creps_jax.policies.bounds import RUN_CONSTRAINTS
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.learned import load
 from creps_jax.robots.robot import NAO, NAO_H25
@@ -37,7 +38,7 @@ from creps_jax.walking.posture import Balance
 from experiments import claims, fig11_walk, request, runner, walk, walk_slope
 from experiments.cli import main
 from experiments.walking import learning as walk_learning
-from experiments.walking.settings import PHYSICS
+from experiments.walking.settings import BOUNDS, PHYSICS, SAMPLERS
 
 SHIPPED = shipped_policy()
 
@@ -156,8 +157,33 @@ def test_a_penalised_search_starts_where_a_squashed_one_does():
     np.testing.assert_allclose(start.coef[0], low + (high - low) / (1 + np.exp(0.3)), rtol=1e-5, atol=1e-6)
     # The slope of the sigmoid there, 0.244, times the standard deviation of one before it.
     np.testing.assert_allclose(jnp.diagonal(start.cov_chol), 0.2445 * (high - low), rtol=1e-3)
-    with pytest.raises(UserError, match="only kept with the constraint sigmoid, got 'penalty'"):
-        walk.run(settings, jax.random.key(0))
+
+
+def test_a_run_with_a_penalty_keeps_a_policy_that_is_clipped_to_the_bounds(bench):
+    settings = dataclasses.replace(walk.SETTINGS["quick"], constraint="penalty")
+    folder = runner.run(request.Request("walk", settings), console=None, say=lambda _: None)
+    policy, arrays = load(folder / "policy.npz"), files.load_arrays(folder / "arrays.npz")
+    assert policy.parameters.constraint == "clip"
+    trial = walk.chosen_trial(arrays)
+    thetas = np.stack([policy.theta(float(speed)) for speed in arrays["speeds"]])
+    np.testing.assert_allclose(arrays["speed"][trial, :, 0, 0], thetas[:, 7] / thetas[:, 3], rtol=1e-4)
+
+
+def listed(names):
+    *first, last = names
+    return f"{', '.join(first)} or {last}"
+
+
+def test_the_help_lists_the_values_of_settings():
+    text = " ".join((walk.Settings.__doc__ or "").split())
+    for name, values in (
+        ("robot: robot that walks", ROBOTS),
+        ("bounds: bounds of the parameters", BOUNDS),
+        ("constraint: limit on the parameters at their bounds", RUN_CONSTRAINTS),
+        ("sampler: distribution of the contexts in learning", SAMPLERS),
+        ("physics: simulation of the robot", PHYSICS),
+    ):
+        assert f"{name}: {listed(values)}" in text
 
 
 def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
@@ -386,17 +412,15 @@ def test_resume_finds_the_latest_unfinished_run_of_the_robot(bench):
 
 
 @pytest.mark.parametrize("physics", ["mjx", "auto"])
-def test_a_run_from_before_robots_can_be_resumed(bench, physics):
-    """Its checkpoint has the settings of its manifest, without a robot: they have to be the same still."""
+def test_a_run_is_resumed_with_the_settings_of_its_manifest(bench, physics):
     settings = dataclasses.asdict(dataclasses.replace(walk.SETTINGS["quick"].resolved(), physics=physics))
-    del settings["robot"], settings["start_policy"]
     unfinished("1", settings)
     begin = request.default_settings(walk, "walk", resume=True)
     resumed, _, manifest = request.resumed(walk, request.Request("walk", begin, resume=True))
     del settings["iterations"]
     identity = request.identity("walk", resumed, manifest["seed"])
     assert (identity["experiment"], identity["settings"]) == ("walk", settings)
-    assert resumed.physics == physics and resumed.robot == "nao"
+    assert resumed.physics == physics
 
 
 @pytest.mark.parametrize("robot", ROBOTS)

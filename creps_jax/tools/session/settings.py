@@ -9,12 +9,10 @@ from typing import Any
 
 from creps_jax import files
 from creps_jax.errors import UserError
-from creps_jax.policies.bounds import CLIP, SIGMOID, check_constraint, range_error, range_text
+from creps_jax.policies.bounds import SESSION_CONSTRAINTS, SIGMOID, check_constraint, range_error, range_text
 from creps_jax.policies.feature_settings import Features
 from creps_jax.tools.session import plain
 
-CONSTRAINTS = (SIGMOID, CLIP)
-"""How parameters are kept within their bounds: a robot needs all of them inside."""
 MAX_BATCH = 10_000
 """Largest number of trials that are drawn and written at once."""
 MAX_ARCHIVE = 1_000_000
@@ -120,7 +118,8 @@ class Settings:
             start = parameter.start
             if start is not None and self.constraint == SIGMOID and start in (parameter.low, parameter.high):
                 raise UserError(
-                    f"start of {parameter.name} is at its bound, {start:g}, which a sigmoid never reaches"
+                    f"start of {parameter.name} must be inside its bounds, which a sigmoid never reaches, "
+                    f"got {start:g}"
                 )
             if self.first_policy is not None and (start, parameter.spread) != (None, None):
                 raise UserError(f"start and spread of {parameter.name} do not go with first_policy")
@@ -181,20 +180,20 @@ def _check_range(variable: Context) -> None:
 def _check_variables(contexts: Sequence[Context], parameters: Sequence[Parameter]) -> None:
     for name, variables in (("contexts", contexts), ("parameters", parameters)):
         if not variables:
-            raise UserError(f"{name} must name at least one")
+            raise UserError(f"{name} must name at least one, got none")
     if len(contexts) > MAX_CONTEXTS:
         raise UserError(f"contexts must be at most {MAX_CONTEXTS}, got {len(contexts)}")
     names = [variable.name for variable in (*contexts, *parameters)]
     for name in names:
         if names.count(name) > 1:
-            raise UserError(f"{name!r} is the name of two variables")
+            raise UserError(f"names of variables must be different, got {name!r} twice")
 
 
 def _check_numbers(settings: Settings) -> None:
-    check_constraint(settings.constraint, CONSTRAINTS)
+    check_constraint(settings.constraint, SESSION_CONSTRAINTS)
     if (settings.mean_kl_bound is None) != (settings.cov_kl_bound is None):
         raise UserError(
-            "mean_kl_bound and cov_kl_bound must be numbers both, or null both, "
+            "mean_kl_bound and cov_kl_bound must both be numbers or both be null, "
             f"got {settings.mean_kl_bound} and {settings.cov_kl_bound}"
         )
     for name in ("kl_bound", "mean_kl_bound", "cov_kl_bound"):
