@@ -1,7 +1,7 @@
-"""Where the algorithm meets the task: one compiled iteration, runs and trials of it, evaluation.
+"""Run a search on a task: one compiled iteration, runs, trials, evaluation.
 
-Every random number of a run follows from its key and the number of the iteration, so that a scan, a
-loop and a resumed run draw the same ones. Rollouts are shared out over the devices.
+All random numbers of an iteration follow from the key of the run and the number of the iteration: a scan, a
+loop and a resumed run draw the same numbers. The devices share the rollouts.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,19 +49,19 @@ class Samples(NamedTuple):
 
 
 class IterationLog(NamedTuple):
-    """What happened in an iteration; only a reader needs it."""
+    """The log of an iteration; the search does not use it."""
 
     info: Any
-    """What the search says of its update: `CrepsInfo` of contextual REPS."""
+    """Diagnostics of the update: `CrepsInfo` for contextual REPS."""
     mean_reward: Scalar
     """Mean reward of the new samples, failed ones included."""
     num_failed: IntScalar
     """Number of new samples whose reward was not finite and was replaced by the task's worst."""
     outcome: Any
-    """Mean of each field of the task's outcome over the new samples that did not fail: of a boolean
+    """Mean of each field of the task's outcome over the new samples that did not fail; for a boolean field
     the fraction. NaN if all failed."""
     samples: Samples | None = None
-    """The new samples; None in the logs of several iterations, which may differ in their number."""
+    """The new samples; None in stacked logs, as iterations may differ in the number of samples."""
 
 
 @checks.arguments
@@ -71,20 +71,19 @@ def make_iteration(
     """Make one iteration: sample contexts and parameters, roll out, archive, dual, weighted fit.
 
     Args:
-        task: What to learn.
-        algorithm: What learns it.
+        task: The task.
+        algorithm: The search.
         samples: Number of new samples.
-        devices: Devices that share the rollouts, by default all local ones. Nothing that is drawn
-            depends on them.
+        devices: Devices that share the rollouts, by default all local ones. The random numbers do not depend
+            on them.
 
     Returns:
-        A compiled function (key, state) -> (state, log). The key is that of the whole run, the same in
-        every iteration: the iteration's own is `fold_in(key, state.iteration)`. The function may be
-        scanned, and vmapped over keys and states. It raises ValueError if the state does not fit
-        the task.
+        A compiled function (key, state) -> (state, log). The key is the key of the run, the same in all
+        iterations; an iteration uses `fold_in(key, state.iteration)`. The function can be scanned, and
+        vmapped over keys and states. It raises ValueError if the state does not fit the task.
 
     Raises:
-        ValueError: If an argument is no task, algorithm, positive whole number or devices.
+        ValueError: If an argument has the wrong type, or `samples` is not a positive whole number.
 
     Source: Abdolmaleki et al. 2016, Algorithm 1.
     """
@@ -112,18 +111,18 @@ def train(
     on_iteration: OnIteration | None = None,
     devices: Devices = None,
 ) -> tuple[Any, IterationLog]:
-    """Run iterations of learning, from a first policy or on from a state.
+    """Run iterations of learning, from a first policy or from the state of an earlier run.
 
     Args:
-        key: Key of the run. To resume a run, give the key it began with.
-        task: What to learn.
-        algorithm: What learns it.
-        start: The policy to begin with, or the state to go on from.
+        key: Key of the run. To resume a run, give the same key again.
+        task: The task.
+        algorithm: The search.
+        start: The first policy, or the state of the run to resume.
         iterations: Number of iterations to run now.
         samples: Number of new samples of each iteration.
-        first_samples: Number of new samples of the very first iteration of a run, if it differs.
+        first_samples: Number of new samples of the first iteration of a run, if it differs.
         on_iteration: Called on the host as (state, log) after each iteration, for progress and
-            checkpoints; this log holds the samples too. If it returns True, the run ends there. Without it
+            checkpoints; this log also holds the samples. If it returns True, the run ends. Without it
             all iterations are one `lax.scan`, with the same numbers.
         devices: Devices that share the rollouts, by default all local ones.
 
@@ -132,18 +131,18 @@ def train(
         `on_iteration` ended the run.
 
     Raises:
-        ValueError: If an argument is none of what is asked for here, or state, task and features do not fit
-            each other.
+        ValueError: If an argument has the wrong type or is out of its range, or state, task and features do
+            not fit each other.
     """
     _check_callback(on_iteration)
     state = start if isinstance(start, SearchState) else algorithm.init(start)
     _check_state("what init returns", state)
     algorithm.policy(state)  # Refuses the state of another search.
-    phases = _phases(task, state, iterations, samples, first_samples, devices)
-    chosen = phases[0][0].devices
-    key, state = replicate((key, state), chosen)
-    state, logs = _run(algorithm, _iterate, phases, key, state, on_iteration)
-    return state, from_host(logs, chosen)
+    setup = _Setup(task, samples, device_tuple(devices))
+    key, state = replicate((key, state), setup.devices)
+    loop = partial(_loop, algorithm, _iterate, key, on_iteration)
+    state, logs = _run(loop, setup, state, iterations, first_samples)
+    return state, from_host(logs, setup.devices)
 
 
 @checks.arguments
@@ -161,19 +160,20 @@ def train_trials(
 ) -> tuple[Any, IterationLog]:
     """Run several trials of `train` at once.
 
-    Devices share the trials where these divide by their number, and otherwise the rollouts of all of them.
+    The devices share the trials if the number of trials is a multiple of the number of devices; otherwise
+    they share the rollouts of all trials.
 
     Args:
         keys: Key of each trial.
-        task: What to learn.
-        algorithm: What learns it.
-        start: The policy that every trial begins with, or the states (trials, ...) to go on from.
+        task: The task.
+        algorithm: The search.
+        start: The first policy of all trials, or the states (trials, ...) of the runs to resume.
         iterations: Number of iterations to run now.
         samples: Number of new samples of each iteration of each trial.
-        first_samples: Number of new samples of the very first iteration, if it differs.
+        first_samples: Number of new samples of the first iteration of a run, if it differs.
         on_iteration: As in `train`; state and log have a first axis of trials.
-        devices: Devices that share the work, by default all local ones. Nothing that is drawn
-            depends on them.
+        devices: Devices that share the work, by default all local ones. The random numbers do not depend on
+            them.
 
     Returns:
         The last states (trials, ...), and the logs (trials, iterations, ...).
@@ -195,13 +195,13 @@ def train_trials(
         first = algorithm.init(start)
         _check_state("what init returns", first)
         states = jax.tree.map(lambda x: jnp.broadcast_to(x, (num_trials, *jnp.shape(x))), first)
-    phases = _phases(task, states, iterations, samples, first_samples, devices)
-    setup = phases[0][0]
+    setup = _Setup(task, samples, device_tuple(devices))
     if _shares_trials(setup, num_trials):
         keys, states = spread_rows((keys, states), setup.devices)
     else:
         keys, states = replicate((keys, states), setup.devices)
-    states, logs = _run(algorithm, _iterate_trials, phases, keys, states, on_iteration)
+    loop = partial(_loop, algorithm, _iterate_trials, keys, on_iteration)
+    states, logs = _run(loop, setup, states, iterations, first_samples)
     return states, from_host(jax.tree.map(lambda x: np.swapaxes(x, 0, 1), logs), setup.devices)
 
 
@@ -215,18 +215,18 @@ def evaluate(
     repeats: int = 1,
     devices: Devices = None,
 ) -> Any:
-    """Roll out given parameters, such as `algorithm.mean(policy, contexts)`, with fresh seeds.
+    """Roll out given parameters, such as `algorithm.mean(policy, contexts)`, with new random numbers.
 
     Args:
-        key: Random key; every rollout gets its own.
+        key: Random key; each rollout gets a key that is derived from it.
         task: The task.
         contexts: One context for each row of `thetas`.
-        thetas: Parameters to try.
+        thetas: The parameters.
         repeats: Number of rollouts of each row.
         devices: Devices that share the rollouts, by default all local ones.
 
     Returns:
-        The task's outcome with leading axes (n, repeats); rewards that were not finite are the
+        The task's outcome with leading axes (n, repeats). Rewards that were not finite are replaced by the
         task's worst.
 
     Raises:
@@ -235,7 +235,7 @@ def evaluate(
     num = len(contexts)
     if contexts.shape[1] != task.context_dim or thetas.shape[1] != task.theta_dim:
         raise ValueError(
-            f"the task takes contexts (n, {task.context_dim}) and thetas (n, {task.theta_dim}), "
+            f"contexts must be (n, {task.context_dim}) and thetas (n, {task.theta_dim}), "
             f"got {contexts.shape} and {thetas.shape}"
         )
     chosen = device_tuple(devices)
@@ -249,16 +249,16 @@ def evaluate(
 def learned(
     task: Task, algorithm: Creps, state: Any, *, made_for: Mapping[str, Any] | None = None
 ) -> Learned:
-    """Put the policy of a state together with what the task states of contexts and parameters.
+    """Combine the policy of a state with the contexts and parameters of its task.
 
     The result describes itself: it returns parameters by name, in their units and bounds, and can be saved.
 
     Args:
-        task: The task that was learned, with `contexts` and `parameters`. Those of this library have them,
-            and `sigmoid_constrained` and `penalised` put their bounds in.
-        algorithm: What learned it, made by `creps`.
+        task: The task that was learned, with `contexts` and `parameters`. The tasks of this library have
+            them, and `sigmoid_constrained` and `penalised` set their bounds.
+        algorithm: The search, made by `creps`.
         state: The state after `train`.
-        made_for: Plain values to keep with the policy, such as the name of the task and its settings.
+        made_for: Plain values that are kept with the policy, such as name and settings of the task.
 
     Returns:
         The learned policy.
@@ -279,7 +279,7 @@ def learned(
 
 
 class _Setup(NamedTuple):
-    """What an iteration is compiled for besides the algorithm; hashable."""
+    """The settings for which an iteration is compiled, without the algorithm; hashable."""
 
     task: Task
     samples: int
@@ -292,7 +292,7 @@ Iterate = Callable[[_Setup, Search, PRNGKey, Any], tuple[Any, IterationLog]]
 def _program(algorithm: Search, function: Callable, *static: Any) -> Callable:
     """Return `function(*static, algorithm, key, state)`, compiled as (key, state) -> results.
 
-    Programs live as long as the algorithms that share them.
+    A program is freed with the last of the algorithms that share it.
     """
     programs = algorithm.programs
     if (function, *static) not in programs:
@@ -308,8 +308,8 @@ def _program(algorithm: Search, function: Callable, *static: Any) -> Callable:
 
 def _iterate(setup: _Setup, algorithm: Search, key: PRNGKey, state: Any) -> tuple[Any, IterationLog]:
     task, samples, devices = setup
-    # The barriers keep the compiler from fusing an iteration with what surrounds it, which rounds
-    # differently in a scan and on its own.
+    # The barriers prevent that the compiler fuses an iteration with the code around it: a scan and a single
+    # iteration would round differently.
     key, state = lax.optimization_barrier((threefry(key), state))
     context_key, theta_key, rollout_key = jax.random.split(jax.random.fold_in(key, state.iteration), 3)
     contexts = jax.vmap(partial(_sample_context, task))(jax.random.split(context_key, samples))
@@ -346,9 +346,9 @@ def _sample_context(task: Task, key: PRNGKey) -> Array:
 
 
 def _shares_trials(setup: _Setup, num_trials: int) -> bool:
-    """Say whether devices share trials, which beats sharing rollouts: updates are shared as well.
+    """Return whether devices share trials, which is faster than sharing rollouts: they also share updates.
 
-    Not those of several processes: each one goes on with, and reports, all trials.
+    Devices of several processes do not: each process needs the results of all trials.
     """
     num_processes = len({device.process_index for device in setup.devices})
     return len(setup.devices) > 1 and num_processes == 1 and num_trials % len(setup.devices) == 0
@@ -364,50 +364,48 @@ def _scan(
     return lax.scan(step, state, length=length)
 
 
-def _phases(
-    task: Task,
-    state: Any,
-    iterations: int,
-    samples: int,
-    first_samples: int | None,
-    devices: Devices,
-) -> list[tuple[_Setup, int]]:
-    """List with how many samples to run how many iterations."""
-    ordinary = _Setup(task, samples, device_tuple(devices))
-    is_begun = np.any(np.asarray(state.iteration) > 0)
-    if first_samples is None or is_begun:
-        return [(ordinary, iterations)]
-    phases = [(ordinary._replace(samples=first_samples), 1), (ordinary, iterations - 1)]
-    return [(setup, length) for setup, length in phases if length > 0]
-
-
 def _run(
+    loop: Callable, setup: _Setup, state: Any, iterations: int, first_samples: int | None
+) -> tuple[Any, IterationLog]:
+    """Run iterations, the first one of a run with `first_samples`; return the last state and stacked logs."""
+    if first_samples is None or np.any(np.asarray(state.iteration) > 0):
+        state, logs, _ = loop(setup, iterations, state)
+        return state, logs
+    state, logs, is_ended = loop(setup._replace(samples=first_samples), 1, state)
+    if is_ended or iterations == 1:
+        return state, logs
+    state, others, _ = loop(setup, iterations - 1, state)
+    return state, jax.tree.map(lambda *x: np.concatenate(x), logs, others)
+
+
+def _loop(
     algorithm: Search,
     iterate: Iterate,
-    phases: list[tuple[_Setup, int]],
     key: Array,
-    state: Any,
     on_iteration: OnIteration | None,
-) -> tuple[Any, IterationLog]:
-    """Run all phases, as scans or as loops; return the logs on the host, stacked along a first axis."""
-    logs = []
-    for setup, length in phases:
-        if on_iteration is None and length > 1:
-            scan = _program(algorithm, _scan, iterate, setup, length)
-            state, log = scan(key, state)
-            logs.append(jax.device_get(log))
-            continue
-        program = _program(algorithm, iterate, setup)
-        for _ in range(length):
-            state, log = program(key, state)
-            logs.append(jax.tree.map(lambda x: x[None], jax.device_get(log._replace(samples=None))))
-            if on_iteration is not None and _is_end(on_iteration(state, log)):
-                return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
-    return state, jax.tree.map(lambda *x: np.concatenate(x), *logs)
+    setup: _Setup,
+    length: int,
+    state: Any,
+) -> tuple[Any, IterationLog, bool]:
+    """Run iterations of equal size, as a scan or as a loop.
+
+    Returns:
+        The last state, the logs on the host, stacked along a first axis, and whether `on_iteration` has ended
+        the run.
+    """
+    if on_iteration is None and length > 1:
+        state, log = _program(algorithm, _scan, iterate, setup, length)(key, state)
+        return state, jax.device_get(log), False
+    program, logs, is_ended = _program(algorithm, iterate, setup), [], False
+    while len(logs) < length and not is_ended:
+        state, log = program(key, state)
+        logs.append(jax.device_get(log._replace(samples=None)))
+        is_ended = on_iteration is not None and _is_end(on_iteration(state, log))
+    return state, jax.tree.map(lambda *x: np.stack(x), *logs), is_ended
 
 
 def _is_end(answer: Any) -> bool:
-    """Say whether a callback has returned True, as Python, NumPy or jax have it."""
+    """Return whether a callback has returned True, as a boolean of Python, NumPy or jax."""
     is_boolean = isinstance(answer, bool | np.bool_) or getattr(answer, "dtype", None) == np.bool_
     return is_boolean and bool(answer)
 
@@ -418,7 +416,7 @@ def _check_callback(on_iteration: OnIteration | None) -> None:
 
 
 def _check_state(name: str, state: Any) -> None:
-    """Refuse what is no state; whether it is one of the search, its functions will see."""
+    """Check that a value is the state of a search; the functions of the search check the rest."""
     if not isinstance(state, SearchState):
         raise ValueError(
             f"{name} must be the state of a search, with a field iteration, got {checks.shown(state)}"

@@ -315,7 +315,9 @@ def test_refuses_states_that_are_not_one_for_each_key(key):
 
 
 def test_evaluation_refuses_what_does_not_fit(key):
-    with pytest.raises(ValueError, match=r"contexts \(n, 1\) and thetas \(n, 2\), got \(4, 1\) and \(4, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"contexts must be \(n, 1\) and thetas \(n, 2\), got \(4, 1\) and \(4, 3\)"
+    ):
         evaluate(key, TASK, jnp.zeros((4, 1)), jnp.zeros((4, 3)))
     with pytest.raises(ValueError, match="repeats must be at least 1, got 0"):
         evaluate(key, TASK, jnp.zeros((4, 1)), jnp.zeros((4, 2)), repeats=0)
