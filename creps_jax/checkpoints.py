@@ -1,4 +1,4 @@
-"""Save the state of a learner and what it has logged, so that a run can go on where it stopped."""
+"""Save and load the state and the log of a run, so that it can be resumed."""
 
 import json
 from collections.abc import Mapping
@@ -16,10 +16,10 @@ _STATE, _LOG = "state.", "log."
 
 
 class Checkpoint(NamedTuple):
-    """What a learner needs to go on, and what it has logged.
+    """The state of a search, and its log.
 
     Attributes:
-        state: a pytree of arrays, as it was saved.
+        state: a pytree of arrays.
         log: arrays by name, with a leading axis of iterations.
     """
 
@@ -37,7 +37,7 @@ def named_leaves(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
 
 
 def append_log(log: Mapping[str, np.ndarray], row: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Add one iteration's arrays to those with a leading axis of iterations."""
+    """Append the arrays of one iteration to the log, whose arrays have a leading axis of iterations."""
     new = {name: values[None] for name, values in row.items()}
     return {name: np.concatenate([log[name], new[name]]) for name in new} if log else new
 
@@ -48,10 +48,10 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, *, run: Mapping[str, Any
     Args:
         path: an .npz file.
         checkpoint: state and log.
-        run: what tells this run from others, as plain values: experiment, settings, seed, trial.
+        run: identity of the run, as plain values: experiment, settings, seed, trial.
 
     Raises:
-        UserError: if the file cannot be written; an earlier checkpoint stays whole.
+        UserError: if the file cannot be written; an earlier checkpoint is kept.
     """
     arrays = {"format": np.array(_FORMAT), "run": np.array(_canonical(run))}
     arrays |= named_leaves(checkpoint.state, _STATE)
@@ -60,15 +60,15 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint, *, run: Mapping[str, Any
 
 
 def load_checkpoint(path: Path, template: Any, *, run: Mapping[str, Any]) -> Checkpoint:
-    """Read a checkpoint; the file is left as it is, whatever comes.
+    """Read a checkpoint; the file is not changed.
 
     Args:
         path: the .npz file.
-        template: a state of the structure, shapes and types that are expected.
+        template: a state of the expected structure, shapes and types.
         run: as for `save_checkpoint`; a checkpoint of another run is refused.
 
     Raises:
-        UserError: if the file is missing, cut short, no checkpoint, or that of another run.
+        UserError: if the file is missing, is cut short, is not a checkpoint, or belongs to another run.
     """
     arrays = load_arrays(path)
     if str(arrays.get("format")) != _FORMAT:

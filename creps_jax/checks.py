@@ -1,7 +1,7 @@
-"""Check what users hand over, where it comes in: one `ValueError` that shows the value and what was expected.
+"""Check the arguments of public functions: a `ValueError` shows the value and what was expected.
 
-Types and shapes are known while a program is traced, values are not: those of traced arrays pass. No check
-adds anything to a compiled program.
+While a program is traced, types and shapes are known, but values are not: the values of traced arrays are not
+checked. Checks add nothing to a compiled program.
 """
 
 import contextlib
@@ -45,35 +45,36 @@ __all__ = [
 FLOAT32_MAX = float(np.finfo(np.float32).max)
 """The largest finite number."""
 FLOAT32_TINY = float(np.finfo(np.float32).tiny)
-"""The smallest number above zero that compiled programs do not take for zero."""
+"""The smallest number above zero that compiled programs do not round to zero."""
 LARGEST = 1e15
-"""Size of numbers up to which products of two of them, and sums of those, are finite in float32."""
+"""Largest size of numbers whose products, and sums of products, are finite in float32."""
 NARROWEST = 1e-30
-"""The least width of a range: float32 can hold parts of it too, such as a millionth."""
+"""The least width of a range: float32 can also hold a millionth of it."""
 _MOST = 2**31 - 1
 """The largest count: indices have 32 bits."""
 _MOST_POINTS = 10_000_000
-"""The largest grid: its size is a power, and a slip would fill the memory."""
+"""The largest number of points of a grid; more would fill the memory."""
 _WIDTH = 80
-"""Characters of a value that errors show."""
+"""Largest number of characters of a value in an error."""
 
 F = TypeVar("F", bound=Callable[..., Any])
 A = TypeVar("A", Array, np.ndarray)
 _Arrays = dict[str, tuple[list[str], tuple[int, ...]]]
 """Names and sizes of the axes of arguments."""
 _SMALLEST_WEIGHT = 1e-30
-"""Size of the largest weight, or the inverse of it, from which on weights are scaled."""
+"""If the largest weight is not between this number and its inverse, weights are scaled."""
 
 
 def arguments(function: F) -> F:
-    """Check the arguments of a function by its annotations, whenever it is called.
+    """Check the arguments of a function against its annotations in each call.
 
-    Arrays (`Float[Array, "n 3"]`) become floats of the shape that is written there, in which a name has one
-    size throughout. Numbers (`float`, `ScalarLike`) have to be finite, an `int` is a count, a `PRNGKey` one
-    key, and of other classes, such as records, a value is an instance. Other annotations are not looked at.
+    An argument `Float[Array, "n 3"]` is converted to an array of floats and must have this shape; a name is
+    the same size in all arguments. Numbers (`float`, `ScalarLike`) must be finite, an `int` must be a count,
+    a `PRNGKey` a single key, and a value of another class, such as a record, an instance. Other annotations
+    are ignored.
 
     Raises:
-        ValueError: By the function, if an argument is something else.
+        ValueError: In a call of the function, if an argument does not fit its annotation.
     """
     signature, annotations = inspect.signature(function), inspect.get_annotations(function, eval_str=True)
 
@@ -82,7 +83,7 @@ def arguments(function: F) -> F:
         try:
             bound, arrays = signature.bind(*args, **kwargs), {}
         except TypeError as error:
-            raise TypeError(f"{function.__name__}() {error}") from None  # as Python has it
+            raise TypeError(f"{function.__name__}() {error}") from None  # the message of Python
         for name, value in bound.arguments.items():
             bound.arguments[name] = _checked_argument(name, value, annotations.get(name), arrays)
         return function(*bound.args, **bound.kwargs)
@@ -91,7 +92,7 @@ def arguments(function: F) -> F:
 
 
 def shown(value: Any) -> str:
-    """Write a value as errors show it, in one short line: an array by its type and shape."""
+    """Return the text of a value in an error, one short line; for an array its type and shape."""
     if isinstance(value, Tracer):
         return f"traced {value.dtype}{value.shape}"
     if isinstance(value, np.ndarray | jax.Array):
@@ -102,7 +103,7 @@ def shown(value: Any) -> str:
 
 
 def count(name: str, value: Any, *, least: int = 1) -> int:
-    """Return a number of things, after checking that it is whole and neither too small nor beyond any index.
+    """Return a count, after checking that it is whole, at least `least`, and not above the largest index.
 
     Raises:
         ValueError: If it is not.
@@ -115,10 +116,10 @@ def count(name: str, value: Any, *, least: int = 1) -> int:
 
 
 def grid(name: str, num: Any, dim: int, *, least: int = 1) -> tuple[int, ...]:
-    """Return how many points a grid has along each of its `dim` axes, after checking that all fit in memory.
+    """Return the number of points of a grid along each axis, after checking that all points fit in memory.
 
     Args:
-        name: What errors call the number.
+        name: Name of the number in errors.
         num: One number for all axes, or a sequence with one for each.
         dim: Number of axes.
         least: The least number along an axis.
@@ -143,9 +144,9 @@ def grid(name: str, num: Any, dim: int, *, least: int = 1) -> tuple[int, ...]:
 
 
 def number(name: str, value: Any, *, least: float = -math.inf, above: float = -math.inf) -> Any:
-    """Return a number, after checking that it is a real one, finite in float32 and in its limits.
+    """Return a number, after checking that it is real, finite in float32 and within its limits.
 
-    That of an array without axes is returned as Python has it.
+    An array without axes is returned as a number of Python.
 
     Raises:
         ValueError: If it is not.
@@ -163,10 +164,10 @@ def number(name: str, value: Any, *, least: float = -math.inf, above: float = -m
 
 
 def vector(name: str, value: Any, *, largest: float = FLOAT32_MAX) -> np.ndarray:
-    """Return a setting that is a number or a vector, given outside of any trace, as an array of NumPy.
+    """Return a number or vector, which must not be traced, as a NumPy array.
 
     Raises:
-        ValueError: If it is something else, or an entry is farther from zero than `largest`.
+        ValueError: If it is something else, or the size of an entry is above `largest`.
     """
     try:
         values = np.asarray(value)
@@ -180,10 +181,10 @@ def vector(name: str, value: Any, *, largest: float = FLOAT32_MAX) -> np.ndarray
 
 
 def ends(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return both ends of a range as vectors of one length, after checking that the one is below the other.
+    """Return both ends of a range as vectors of one length, after checking that `low` is below `high`.
 
     Raises:
-        ValueError: If it is not, or by less than `NARROWEST`, or they are no vectors of one length.
+        ValueError: If it is not, or by less than `NARROWEST`, or if they are not vectors of one length.
     """
     low, high = np.atleast_1d(vector("low", low)), np.atleast_1d(vector("high", high))
     if low.shape != high.shape:
@@ -199,7 +200,7 @@ def ends(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
 def host_array(
     name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, note: str = ""
 ) -> Array | np.ndarray:
-    """Return numbers as `array` does, but leave those that are not of jax with NumPy, in their precision.
+    """Return numbers as `array` does, but convert those that are not jax arrays to NumPy, in their precision.
 
     Raises:
         ValueError: As `array` does.
@@ -219,16 +220,16 @@ def host_array(
 
 
 def array(name: str, value: Any, shape: tuple[int | str, ...] | None = None, *, note: str = "") -> Array:
-    """Return numbers as an array of floats, of 32 bits at least; one that is such is returned as it is.
+    """Return numbers as an array of floats of at least 32 bits; such an array is returned unchanged.
 
     Args:
-        name: What they are, for the error.
-        value: Real numbers; those that are not finite pass, see `finite`.
-        shape: The shape that they must have, if any; a letter stands for any number above zero.
-        note: Why, for the error.
+        name: Name of the array in errors.
+        value: Real numbers; infinite numbers and NaN are allowed, see `finite`.
+        shape: The required shape; a letter is any size above zero. None allows any shape.
+        note: Reason for the shape, which errors add.
 
     Raises:
-        ValueError: If they are no real numbers, or have another shape.
+        ValueError: If the values are not real numbers, or have another shape.
     """
     try:
         result = value if isinstance(value, jax.Array) else _converted(value)
@@ -250,17 +251,17 @@ def finite(
     above: float = -math.inf,
     largest: float = FLOAT32_MAX,
 ) -> A:
-    """Return an array as it is, after checking its entries, unless they are traced.
+    """Return an array unchanged, after checking its entries, unless they are traced.
 
     Args:
-        name: What they are, for the error.
+        name: Name of the array in errors.
         values: The array.
-        least: The least that an entry may be.
-        above: What entries have to be above.
-        largest: How far from zero an entry may be, infinitely far too; by default any finite distance.
+        least: Lower limit of the entries, which is allowed.
+        above: Lower limit of the entries, which is not allowed.
+        largest: Upper limit of the size of the entries; may be infinity. By default entries must be finite.
 
     Raises:
-        ValueError: If an entry is NaN, or out of its limits.
+        ValueError: If an entry is NaN, or outside the limits.
     """
     if not isinstance(values, Tracer):
         known = np.asarray(values)
@@ -271,7 +272,7 @@ def finite(
 
 
 def in_range(weights: Any) -> Any:
-    """Return weights, of which only ratios matter, in the range of single precision, as exp(-200) is not."""
+    """Return weights, scaled into the range of float32 if they are outside; only their ratios matter."""
     if isinstance(weights, np.ndarray) and weights.dtype == np.float64 and np.isfinite(weights).all():
         largest = weights.max(initial=0.0)
         if largest > 0 and not _SMALLEST_WEIGHT < largest < 1.0 / _SMALLEST_WEIGHT:
@@ -280,12 +281,12 @@ def in_range(weights: Any) -> Any:
 
 
 def key(name: str, value: Any, *, num_axes: int = 0) -> Any:
-    """Return a random key as it is, or an array of keys, after checking that it is one.
+    """Return a random key, or an array of keys, unchanged, after checking it.
 
-    Typed keys may be of any implementation; raw ones, of uint32, are of the default one.
+    Typed keys can be of any implementation; raw keys of uint32 are of the default implementation.
 
     Raises:
-        ValueError: If it is something else, or has another number of axes.
+        ValueError: If it is not a key, or has another number of axes.
     """
     shape = key_shape(value)
     if shape is None or len(shape) != num_axes or 0 in shape:
@@ -298,7 +299,7 @@ def key(name: str, value: Any, *, num_axes: int = 0) -> Any:
 
 
 def function(name: str, value: Any, signature: str) -> None:
-    """Refuse what cannot be called.
+    """Check that a value can be called; `signature` is shown in the error.
 
     Raises:
         ValueError: If it cannot.
@@ -308,10 +309,10 @@ def function(name: str, value: Any, signature: str) -> None:
 
 
 def instance(name: str, value: Any, *kinds: type) -> None:
-    """Refuse what is of none of these types.
+    """Check that a value has one of these types.
 
     Raises:
-        ValueError: If it is of none.
+        ValueError: If it does not.
     """
     if not isinstance(value, kinds):
         wanted = " or ".join(kind.__name__ for kind in kinds)
@@ -329,7 +330,7 @@ def _check_shape(name: str, got: tuple[int, ...], wanted: tuple[int | str, ...],
 
 
 def _checked_argument(name: str, value: Any, kind: Any, arrays: _Arrays) -> Any:
-    """Return an argument as it is annotated; `arrays` holds the axes of those so far."""
+    """Return an argument as its annotation requires; `arrays` holds the axes of earlier arguments."""
     kinds = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
     if type(None) in kinds:
         if value is None:
@@ -366,16 +367,16 @@ def _checked_array(name: str, value: Any, axes: list[str], arrays: _Arrays) -> A
 
 
 def _converted(value: Any) -> Array:
-    """Return an array of jax, by way of NumPy where that can: jax takes letters in a list for types."""
+    """Return a jax array, if possible by way of NumPy: jax reads letters in a list as types."""
     with contextlib.suppress(TypeError, ValueError):  # traced, or ragged
         value = np.asarray(value)
-    # What is too large for the format becomes infinite, and needs no warning besides.
+    # A number that is too large for the format becomes infinite, without a warning.
     with np.errstate(over="ignore"):
         return jnp.asarray(value)
 
 
 def _limits(least: float, above: float, largest: float = FLOAT32_MAX) -> str:
-    """Say in words which numbers are wanted."""
+    """Describe the allowed numbers in words."""
     words = {FLOAT32_MAX: "finite", math.inf: "numbers"}.get(largest, f"at most {largest:g} in size")
     if above > least:
         return f"{words} and above {above:g}"
@@ -393,8 +394,8 @@ def _is_real(values: np.ndarray | jax.Array) -> bool:
 
 
 def converted(values: Any, dtype: jnp.dtype) -> Any:
-    """Convert an array; what has that type is returned as it is, as even an idle conversion takes time."""
+    """Convert an array; an array of this type is returned unchanged, as each conversion takes time."""
     if values.dtype == dtype and not getattr(values, "weak_type", False):
         return values
-    with np.errstate(over="ignore"):  # What is too large for the format becomes infinite: not valid.
+    with np.errstate(over="ignore"):  # A number that is too large for the format becomes infinite.
         return values.astype(dtype)

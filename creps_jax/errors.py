@@ -1,4 +1,4 @@
-"""Tell users what is wrong, in one line."""
+"""Errors that a user can correct, in one line."""
 
 import difflib
 from collections.abc import Iterable
@@ -7,11 +7,11 @@ __all__ = ["UserError", "suggest"]
 
 
 class UserError(ValueError):
-    """A mistake that the user can correct: a file, a name or a setting. Commands print its message alone."""
+    """A mistake that the user can correct: a file, a name or a setting. Commands print only its message."""
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
-    """Return how an error about an unknown name goes on: with the nearest one, and all of them."""
+    """Return the end of an error about an unknown name: the nearest known name, and all known names."""
     known = list(known)
     near = difflib.get_close_matches(name, known, n=1)
     hint = f", did you mean {near[0]!r}?" if near else ","

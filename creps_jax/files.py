@@ -1,4 +1,4 @@
-"""Read and write files: arrays, texts and JSON, always whole."""
+"""Read and write files of arrays, text and JSON; a file is written completely or not at all."""
 
 import contextlib
 import errno
@@ -19,7 +19,7 @@ from creps_jax.errors import UserError
 
 
 def package_version() -> str:
-    """Return the version of creps_jax, installed or not."""
+    """Return the version of creps_jax, of the installed package or of the checkout."""
     with contextlib.suppress(importlib.metadata.PackageNotFoundError):
         return importlib.metadata.version("creps_jax")
     with contextlib.suppress(OSError, KeyError, tomllib.TOMLDecodeError):
@@ -36,21 +36,22 @@ def models_folder() -> Path:
 
 
 def policies_folder(robot: str = "nao") -> Path:
-    """Return the folder of the policies of a robot that come with the package."""
+    """Return the folder of the shipped policies of a robot."""
     return models_folder() / robot / "policies"
 
 
 def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file so that a reader finds either the old one or the new one, whole.
+    """Write a file atomically: a reader finds the complete old file or the complete new one.
 
-    The bytes go to a temporary name in the same folder, to the disk, and only then to the name.
+    The bytes are written to a temporary file in the same folder, and synced to the disk; then the file is
+    renamed.
 
     Args:
-        path: where the file shall be; its folder is made if need be.
-        write: gets the open file and writes to it.
+        path: the file; its folder is made if it does not exist.
+        write: function that writes to the open file.
 
     Raises:
-        UserError: if the file cannot be written, a full disk for example; an earlier file stays.
+        UserError: if the file cannot be written, for example on a full disk; an earlier file is kept.
     """
     temporary: Path | None = None
     try:
@@ -61,7 +62,7 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        # mkstemp makes files private; results are as readable as any other file.
+        # mkstemp makes private files; results get the usual permissions.
         temporary.chmod(0o666 & ~umask())
         os.replace(temporary, path)
         temporary = None
@@ -78,10 +79,10 @@ def write_atomically(path: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """See that the names in a folder, and not only what their files hold, last a loss of power.
+    """Sync the names of the files in a folder to the disk, so that a loss of power does not remove them.
 
     Raises:
-        UserError: if the disk refuses.
+        UserError: if the disk reports an error.
     """
     try:
         handle = os.open(folder, os.O_RDONLY)
@@ -90,7 +91,7 @@ def sync_folder(folder: Path) -> None:
         finally:
             os.close(handle)
     except OSError as error:
-        # Some network file systems know no such thing; there is nothing more to be done on them.
+        # Some network file systems do not support this.
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             reason = error.strerror or error
             raise UserError(f"what was written to {folder} may not last a loss of power: {reason}") from error
@@ -103,17 +104,17 @@ def save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read every array of an .npz file.
+    """Read all arrays of an .npz file.
 
     Raises:
-        UserError: if there is no such file, it is cut short, or it is no .npz file of plain arrays.
+        UserError: if the file does not exist, is cut short, or is not an .npz file of plain arrays.
     """
     if not path.exists():
         raise UserError(f"no such file: {path}")
     if path.is_dir():
         raise UserError(f"{path} is a folder, expected an .npz file")
     try:
-        # Opened here: a file that np.load refuses it would leave open.
+        # Opened here, as np.load does not close a file that it refuses.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             return dict(arrays)
     except OSError as error:
@@ -136,7 +137,7 @@ def load_json(path: Path) -> Any:
     """Read a JSON file.
 
     Raises:
-        UserError: if there is none, it is cut short, it is no JSON, or it names a field twice.
+        UserError: if the file does not exist, is cut short, is not JSON, or has a field twice.
     """
     try:
         return json.loads(path.read_text("utf-8"), object_pairs_hook=_without_repetition)
@@ -157,7 +158,7 @@ def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def check_writable(folder: Path) -> None:
-    """See that a folder can be made and written to, before work is done whose result goes there.
+    """Check that a folder can be made and written to, before the work whose result it gets.
 
     Raises:
         UserError: if it cannot.
@@ -171,7 +172,7 @@ def check_writable(folder: Path) -> None:
 
 
 def umask() -> int:
-    """Return which permissions new files of this process do not get."""
+    """Return the permissions that new files of this process do not get."""
     mask = os.umask(0)
     os.umask(mask)
     return mask

@@ -1,4 +1,4 @@
-"""Tell what a random key is, and make of any key one whose numbers do not depend on the devices."""
+"""Recognise random keys, and convert them to keys whose numbers do not depend on the devices."""
 
 import functools
 import math
@@ -14,9 +14,9 @@ _THREEFRY = "threefry2x32"
 
 
 def key_shape(value: Any) -> tuple[int, ...] | None:
-    """Return the shape of an array of keys, () for a single one, and None for what is no key.
+    """Return the shape of an array of keys: () for a single key, None for a value that is not a key.
 
-    Keys are typed keys of any implementation, and rows of uint32 with the data of the default one.
+    Keys are typed keys of any implementation, or rows of uint32 with the data of the default implementation.
     """
     if not isinstance(value, np.ndarray | jax.Array):
         return None
@@ -29,16 +29,16 @@ def key_shape(value: Any) -> tuple[int, ...] | None:
 
 
 def threefry(key: Any) -> Any:
-    """Turn a random key, or an array of keys, into keys of the implementation threefry2x32.
+    """Convert a random key, or an array of keys, to the implementation threefry2x32.
 
-    Under `vmap` some implementations, such as rbg, draw other numbers for a batch of another size, so that
-    results would depend on the number of devices. Those of threefry2x32 depend on the key alone.
+    Under `vmap` the numbers of some implementations, such as rbg, depend on the size of the batch: results
+    would depend on the number of devices. The numbers of threefry2x32 depend on the key only.
 
     Args:
-        key: Key or keys; those of threefry2x32 are returned as they are.
+        key: Key or keys; keys of threefry2x32 are returned unchanged.
 
     Returns:
-        Typed keys that follow from all words of the data of the given ones.
+        Typed keys, computed from all words of the data of the given keys.
     """
     implementation = jax.random.key_impl(key) if _is_typed(key) else _default_implementation()
     if implementation == _THREEFRY:

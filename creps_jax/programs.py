@@ -1,4 +1,4 @@
-"""Records that keep compiled programs beside their fields."""
+"""A base class for records that keep compiled programs."""
 
 import dataclasses
 from typing import Any
@@ -7,8 +7,8 @@ __all__ = ["KeepsPrograms"]
 
 
 class KeepsPrograms:
-    """A dataclass whose compiled programs, in cached properties, are not pickled with its fields."""
+    """Base class of dataclasses that keep compiled programs in cached properties, which are not pickled."""
 
     def __getstate__(self: Any) -> dict[str, Any]:
-        """Return the fields alone: programs are compiled anew where they are needed."""
+        """Return the fields only; an unpickled record compiles its programs again."""
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}

@@ -1,4 +1,4 @@
-"""Roll out a batch of parameters for a task, shared out over devices, and see to failures."""
+"""Roll out a batch of parameters for a task on several devices, and replace rewards that are not finite."""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
@@ -28,19 +28,19 @@ __all__ = [
 ]
 
 Devices = Sequence[jax.Device] | None
-"""Devices that share the rollouts; None stands for all local ones."""
+"""Devices that share the rollouts; None means all local devices."""
 
 ChosenDevices = tuple[jax.Device, ...]
-"""Devices in a form that can be compiled for; none of them: wherever the arrays are."""
+"""Devices as a hashable tuple. If it is empty, programs run where their arrays are."""
 
 
 def device_tuple(devices: Devices) -> ChosenDevices:
-    """Return the devices in a form that can be compiled for; all local ones for None.
+    """Return the devices as a hashable tuple; for None all local devices.
 
-    Where there is only one local device, None chooses nothing: arrays stay where they are.
+    If there is only one local device, None gives an empty tuple: arrays stay where they are.
 
     Raises:
-        ValueError: If there is no device, or something else among them, or one of them twice.
+        ValueError: If there is no device, an entry is not a device, or a device is given twice.
     """
     if devices is None:
         local = tuple(jax.local_devices())
@@ -60,28 +60,28 @@ def roll_out(
     contexts: Float[Array, "n s"],
     thetas: Float[Array, "n d"],
 ) -> tuple[Any, Bool[Array, " n"]]:
-    """Roll out a batch over the devices.
+    """Roll out a batch on the devices.
 
     Args:
-        task: What to roll out.
-        devices: Devices that share the rollouts. With fewer than two they run where the arrays are, see
-            `replicate`.
-        key: Random key; that of a rollout follows from its number, whatever device it runs on.
+        task: The task.
+        devices: Devices that share the rollouts. With fewer than two devices, rollouts run where the arrays
+            are, see `replicate`.
+        key: Random key; the key of a rollout follows from the number of the rollout, on any device.
         contexts: Context of each rollout.
         thetas: Parameters of each rollout.
 
     Returns:
-        The task's outcomes (n, ...), where rewards that are not finite are replaced by the task's
-        worst, and which rollouts failed so.
+        The task's outcomes (n, ...), in which rewards that are not finite are replaced by the task's worst;
+        and which rollouts had such a reward.
 
     Raises:
-        ValueError: If a rollout of the task gives anything but an outcome with one reward.
+        ValueError: If a rollout of the task does not return an outcome with one reward.
     """
     num = contexts.shape[0]
     keys = jax.vmap(jax.random.fold_in, (None, 0))(threefry(key), jnp.arange(num))
     rollouts = jax.vmap(lambda *arguments: check_outcome(task.rollout(*arguments)))
     if len(devices) > 1:
-        rollouts = _shared_out(rollouts, devices)
+        rollouts = _distributed(rollouts, devices)
     outcomes = rollouts(keys, contexts, thetas)
     is_failed = ~jnp.isfinite(outcomes.reward)
     given = outcomes.reward.dtype
@@ -92,7 +92,10 @@ def roll_out(
 
 
 def compiled_roll_out(task: Task, devices: ChosenDevices) -> Callable:
-    """Return `roll_out` of a task over devices, compiled: (key, contexts, thetas). The task keeps it."""
+    """Return `roll_out` of a task on devices as a compiled function of (key, contexts, thetas).
+
+    The task keeps the program.
+    """
     if devices not in task.programs:
         # A copy: the program must not keep alive the task that keeps it.
         task.programs[devices] = jax.jit(partial(roll_out, dataclasses.replace(task), devices))
@@ -100,10 +103,10 @@ def compiled_roll_out(task: Task, devices: ChosenDevices) -> Callable:
 
 
 def replicate(tree: Any, devices: ChosenDevices) -> Any:
-    """Put arrays on all chosen devices, where `roll_out` leaves its results, from wherever they are.
+    """Copy arrays to all chosen devices, where `roll_out` leaves its results.
 
-    A state that an iteration finds elsewhere than it leaves it would have the next one compiled anew. While a
-    program is traced, this says on which devices it runs.
+    An iteration would be compiled again if its state were on other devices than the state that it returns.
+    In a traced program this function sets the devices of the program.
     """
     if not devices:
         return tree
@@ -114,9 +117,9 @@ def replicate(tree: Any, devices: ChosenDevices) -> Any:
 
 
 def from_host(tree: Any, devices: ChosenDevices) -> Any:
-    """Make jax arrays of those of the host; where one device was chosen, it holds them.
+    """Convert arrays of the host to jax arrays; if one device was chosen, they are on this device.
 
-    They are not bound to it, so that they can be compared with those of another run.
+    They are not committed to it, so that they can be compared with arrays of another run.
     """
     if len(devices) != 1:
         return jax.tree.map(jnp.asarray, tree)
@@ -125,12 +128,12 @@ def from_host(tree: Any, devices: ChosenDevices) -> Any:
 
 
 def spread_rows(tree: Any, devices: ChosenDevices) -> Any:
-    """Put the rows of arrays on the devices to which `share_rows` gives them."""
+    """Put rows of arrays on the devices on which `share_rows` uses them."""
     return jax.device_put(tree, NamedSharding(_mesh(devices), PartitionSpec("rows")))
 
 
 def mean_outcome(outcomes: Any, is_counted: Bool[Array, " n"]) -> Any:
-    """Average each field (n, ...) of outcomes over the rollouts that count; NaN if none does."""
+    """Average each field (n, ...) of outcomes over the counted rollouts; NaN if there are none."""
 
     def mean(field: Array) -> Array:
         mask = is_counted.reshape(is_counted.shape + (1,) * (field.ndim - 1))
@@ -140,14 +143,14 @@ def mean_outcome(outcomes: Any, is_counted: Bool[Array, " n"]) -> Any:
 
 
 def share_rows(function: Callable, devices: ChosenDevices) -> Callable:
-    """Share the rows of a function's arguments out over devices, which have to divide their number."""
+    """Distribute the rows of a function's arguments over devices, equally many to each device."""
     rows = PartitionSpec("rows")
-    # Unchecked, so that a rollout may start its loops from constants, as it may on one device.
+    # Without the check, as it refuses rollouts whose loops start from constants.
     return jax.shard_map(function, mesh=_mesh(devices), in_specs=rows, out_specs=rows, check_vma=False)
 
 
 def _put_everywhere(sharding: NamedSharding, array: Array) -> Array:
-    """Put an array on the devices of several processes, which jax does not do with typed keys."""
+    """Copy an array to the devices of several processes; jax cannot do this with typed keys."""
     if not jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
         return jax.device_put(array, sharding)
     data = jax.device_put(jax.random.key_data(array), sharding)
@@ -158,17 +161,17 @@ def _mesh(devices: ChosenDevices) -> Mesh:
     return Mesh(np.asarray(devices), ("rows",))
 
 
-def _shared_out(function: Callable, devices: ChosenDevices) -> Callable:
-    """Share a batch out over devices; the last row fills up what does not divide."""
+def _distributed(function: Callable, devices: ChosenDevices) -> Callable:
+    """Distribute a batch over devices; copies of the last row fill it up to a multiple of their number."""
     sharded = share_rows(function, devices)
 
-    def shared_out(*batch: Array) -> Any:
+    def distributed(*batch: Array) -> Any:
         num = batch[0].shape[0]
         padded = -(-num // len(devices)) * len(devices)
         index = jnp.minimum(jnp.arange(padded), num - 1)
         results = sharded(*(x[index] for x in batch))
-        # Every device goes on with all results: the update is small, and equal on each of them.
+        # Each device gets all results, and computes the same update, which is small.
         results = lax.with_sharding_constraint(results, NamedSharding(_mesh(devices), PartitionSpec()))
         return jax.tree.map(lambda x: x[:num], results)
 
-    return shared_out
+    return distributed

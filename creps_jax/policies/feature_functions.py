@@ -17,7 +17,8 @@ from creps_jax.typing import Array, Float
 __all__ = ["Linear", "Polynomial", "Quadratic", "Radial", "grid_of_centers"]
 
 _FAR = 1e20
-"""Largest distance from the range, in bandwidths; contexts farther away are moved to it, against overflow."""
+"""Largest distance from the range, in bandwidths. A context farther away is moved to this distance, so that
+squares do not overflow."""
 _LARGE = 1e30
 """Size of the ends of a range above which differences can overflow, and compiled programs, which multiply by
 the inverse of a bandwidth, can round that inverse to zero."""

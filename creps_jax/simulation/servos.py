@@ -73,7 +73,7 @@ def read_servos(model: mujoco.MjModel) -> Servos:
     is_servo &= np.isin(model.jnt_type[joint], [mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE])
     if not is_servo.all():
         names = [model.actuator(i).name for i in np.flatnonzero(~is_servo)]
-        raise ValueError(f"every actuator must be a position servo on a joint, these are not: {names}")
+        raise ValueError(f"actuators must be position servos on joints, got others: {names}")
     control_range = _range(model.actuator_ctrllimited, model.actuator_ctrlrange)
     torque_range = _range(model.actuator_forcelimited, model.actuator_forcerange)
     return Servos(
