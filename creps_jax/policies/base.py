@@ -6,7 +6,13 @@ from typing import Any, NamedTuple
 from creps_jax.policies.features import FeatureMap
 from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar
 
-__all__ = ["Policy", "WeightedSamples"]
+__all__ = ["MStep", "Policy", "WeightedSamples"]
+
+MStep = Callable[..., Any]
+"""`(old policy, samples, *, ridge, scale, constant) -> new policy`: the fit of a Gaussian policy.
+
+The samples are `WeightedSamples`, the settings those of `fit_weighted_ml`. A function without an argument
+`constant` does not get it."""
 
 
 class WeightedSamples(NamedTuple):

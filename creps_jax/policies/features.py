@@ -43,7 +43,8 @@ class FeatureMap(NamedTuple):
     """The largest value of each feature: penalties on its coefficients are relative to it. None: the standard
     deviation over the samples."""
     constant: tuple[float, ...] | None = None
-    """Coefficients c with `c' features = 1` in every context, which a fit does not penalise; None: none."""
+    """Coefficients c with `c' features = 1` in every context, which a fit does not penalise. None: not
+    stated; a fit looks for one in the samples, see `fit_weighted_ml`."""
     name: str | None = None
     """A name to save and load policies with features of your own."""
 

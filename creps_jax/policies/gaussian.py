@@ -5,7 +5,6 @@ Functions take the features of one context; `jax.vmap` them over a batch.
 
 import dataclasses
 import inspect
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -16,7 +15,7 @@ from jax.scipy.linalg import solve_triangular
 
 from creps_jax import checks
 from creps_jax.numerics.linalg import divided, exact_dot, safe_cholesky, safe_sqrt
-from creps_jax.policies.base import Policy, WeightedSamples
+from creps_jax.policies.base import MStep, Policy, WeightedSamples
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.regression import Regression, as_coefficients, regress
 from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike, VectorLike
@@ -210,15 +209,12 @@ def _weighted_cov_chol(fit: Regression) -> Float[Array, "d d"]:
     return spread[:, None] * safe_cholesky(jnp.where(is_diagonal, 1.0, correlation))
 
 
-def linear_gaussian(
-    features: FeatureMap, *, m_step: Callable[..., LinearGaussian], ridge: float | int = 1e-4
-) -> Policy:
+def linear_gaussian(features: FeatureMap, *, m_step: MStep, ridge: float | int = 1e-4) -> Policy:
     """Make the kind of policy whose states are `LinearGaussian` records.
 
     Args:
         features: Features varphi(s) that the mean is linear in.
-        m_step: How it is fitted to weighted samples, `(old policy, samples, *, ridge, scale) -> new policy`.
-            If it has an argument `constant`, it also gets the constant of the features.
+        m_step: Fit to weighted samples, see `MStep`.
         ridge: Penalty on the coefficients, relative to the square of each feature's scale.
 
     Returns:
@@ -229,7 +225,7 @@ def linear_gaussian(
     """
     checks.instance("features", features, FeatureMap)
     checks.number("ridge", ridge, least=0.0)
-    checks.function("m_step", m_step, "(policy, samples, *, ridge, scale) -> policy")
+    checks.function("m_step", m_step, "(policy, samples, *, ridge, scale, constant) -> policy")
     return Policy(
         features,
         mean=_mean_rows,
@@ -248,7 +244,7 @@ def linear_gaussian(
 class _Fit:
     """Fit a policy with the settings of `linear_gaussian`."""
 
-    m_step: Callable[..., LinearGaussian]
+    m_step: MStep
     ridge: float | int
     scale: tuple[float, ...] | None
     constant: tuple[float, ...] | None
@@ -258,7 +254,9 @@ class _Fit:
             name: None if numbers is None else jnp.asarray(numbers, samples.theta.dtype)
             for name, numbers in (("scale", self.scale), ("constant", self.constant))
         }
-        if "constant" not in inspect.signature(self.m_step).parameters:
+        parameters = inspect.signature(self.m_step).parameters
+        takes_any = any(each.kind is each.VAR_KEYWORD for each in parameters.values())
+        if not (takes_any or "constant" in parameters):
             del settings["constant"]
         fitted = self.m_step(policy, samples, ridge=self.ridge, **settings)
         checks.instance("what m_step returns", fitted, LinearGaussian)

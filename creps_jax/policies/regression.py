@@ -68,7 +68,6 @@ class Regression(NamedTuple):
     """Expected scatter of the residuals, for a variance of one."""
 
 
-@checks.arguments
 def regress(
     features: Float[Array, "n p"],
     theta: Float[Array, "n d"],
@@ -80,6 +79,8 @@ def regress(
     constant: Float[Array, " p"] | None = None,
 ) -> Regression:
     """Regress theta on features; for the arguments and errors see `fit_weighted_ml`.
+
+    The fits that call this function check types and shapes; the numbers are checked here.
 
     Source: Abdolmaleki et al. 2016, Eq. 14.
     """

@@ -11,13 +11,10 @@ import numpy as np
 from jax.typing import DTypeLike
 
 from creps_jax import checks
+from creps_jax.search.dual_scaling import ROUNDING
 from creps_jax.typing import Array, Bool, Float, Int, IntScalar, Scalar, ScalarLike
 
 __all__ = ["Archive", "Batch", "centred_reward", "empty_archive", "push", "split_reward"]
-
-
-_ROUNDING = 1.75
-"""Largest rounding error of a sum of a few terms, in units of their precision."""
 
 
 class Batch(NamedTuple):
@@ -159,7 +156,7 @@ def centred_reward(archive: Archive) -> tuple[Float[Array, " L"], Scalar]:
     halves = jnp.maximum(0.5 * reward - 0.5 * largest, -limit)
     difference = 2.0 * halves + (rest - rest_of_largest)
     centred = jnp.maximum(difference, -2.0 * limit)
-    rounding = _ROUNDING * jnp.max(archive.reward_rounding, where=is_valid, initial=0.0)
+    rounding = ROUNDING * jnp.max(archive.reward_rounding, where=is_valid, initial=0.0)
     return jnp.where(is_valid, centred, 0.0), rounding
 
 

@@ -17,12 +17,11 @@ from jax.typing import ArrayLike
 
 from creps_jax import checks
 from creps_jax.keys import threefry
-from creps_jax.policies.base import Policy
+from creps_jax.policies.base import MStep, Policy
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.search.archive import Batch, empty_archive, push
 from creps_jax.search.base import Search
-from creps_jax.search.fit import MStep
 from creps_jax.search.importance import Importance, empty_history
 from creps_jax.search.input_checks import (
     check_features_are_finite,
@@ -34,7 +33,7 @@ from creps_jax.search.input_checks import (
     precision_of,
     theta_dim_of,
 )
-from creps_jax.search.settings import CrepsSettings, check_features, checked_kl_bound, policy_kind
+from creps_jax.search.settings import CrepsSettings, checked_kl_bound, checked_settings, policy_kind
 from creps_jax.search.update import CrepsInfo, CrepsState, mean_thetas, sample_thetas, update
 from creps_jax.typing import Array, PRNGKey, ScalarLike
 
@@ -94,7 +93,10 @@ class Creps(Search):
         return np.float32(0) if self.settings is None else self.settings.kl_bound
 
     def with_traced(self, traced: Any) -> "Creps":
-        """Return the algorithm with another KL bound; unchanged if one of its functions was replaced."""
+        """Return the algorithm with another KL bound, or unchanged if one of its functions was replaced.
+
+        Compiled programs use it, which contain algorithms of any kind; see `with_kl_bound` for users.
+        """
         if self.settings is None:
             return dataclasses.replace(self)
         return _algorithm(dataclasses.replace(self.settings, kl_bound=checked_kl_bound(traced)))
@@ -103,24 +105,26 @@ class Creps(Search):
         """Return the algorithm with other values of some of the fields of `settings`.
 
         Raises:
-            ValueError: If one of its functions was replaced, so that it has no settings.
+            ValueError: If one of its functions was replaced, so that it has no settings; or if a value is
+                out of its range.
         """
         if self.settings is None:
             raise ValueError("the algorithm must be made by creps() to change its settings, got another one")
-        return _algorithm(dataclasses.replace(self.settings, **changes))
+        fields = {
+            field.name: getattr(self.settings, field.name) for field in dataclasses.fields(self.settings)
+        }
+        return _algorithm(checked_settings(**(fields | changes)))
 
     def with_kl_bound(self, kl_bound: ScalarLike) -> "Creps":
         """Return the algorithm with another KL bound; nothing is compiled anew.
-
-        If one of its functions was replaced, the algorithm has no settings and is returned unchanged.
 
         Args:
             kl_bound: Largest relative entropy of one update, in nats.
 
         Raises:
-            ValueError: If the bound is not a number above 0.
+            ValueError: If the bound is not a number above 0, or one of the functions was replaced.
         """
-        return self.with_traced(kl_bound)
+        return self.with_settings(kl_bound=kl_bound)
 
 
 @checks.arguments
@@ -167,32 +171,16 @@ def creps(
 
     Source: Abdolmaleki et al. 2016, Section 3.1.
     """
-    kl_bound = checked_kl_bound(kl_bound)
-    if significance is not None and not 0 < significance <= 1:
-        raise ValueError(f"significance must be above 0 and at most 1, or None, got {significance}")
     kind = policy_kind(policy_features, ridge, m_step)
-    baseline_features = kind.features if baseline_features is None else baseline_features
-    check_features("policy_features", kind.features)
-    check_features("baseline_features", baseline_features)
-    if kind.features.context_dim != baseline_features.context_dim:
-        raise ValueError(
-            "policy_features and baseline_features must be of the same context, got "
-            f"{kind.features.context_dim} and {baseline_features.context_dim} variables"
-        )
-    if significance is not None and kind.blend is None:
-        raise ValueError(
-            f"significance must be None for a policy that has no function blend, got {significance}"
-        )
-    return _algorithm(
-        CrepsSettings(
-            kind=kind,
-            baseline_features=baseline_features,
-            kl_bound=kl_bound,
-            archive_size=archive_size,
-            importance=importance,
-            significance=significance,
-        )
+    settings = checked_settings(
+        kind=kind,
+        baseline_features=kind.features if baseline_features is None else baseline_features,
+        kl_bound=kl_bound,
+        archive_size=archive_size,
+        importance=importance,
+        significance=significance,
     )
+    return _algorithm(settings)
 
 
 def init(settings: CrepsSettings, policy: Any) -> CrepsState:

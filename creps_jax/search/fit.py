@@ -17,24 +17,20 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.numerics.linalg import divided, exact_dot, safe_sqrt
-from creps_jax.policies.base import WeightedSamples
+from creps_jax.policies.base import MStep, WeightedSamples
 from creps_jax.policies.gaussian import LinearGaussian, fit_weighted_ml
 from creps_jax.policies.regression import Regression, as_coefficients, coordinates, normaliser, regress
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["MStep", "bounded_ml", "fit_within", "weighted_ml"]
+__all__ = ["bounded_ml", "fit_within", "weighted_ml"]
 
 _LOG_MULTIPLIERS = (-12.0, 40.0)
 """Range of the logarithm of a multiplier: at the lower end it has no effect, at the upper nothing moves."""
 _NUM_TRIALS, _NUM_REFINEMENTS = 32, 4
 
-
-MStep = Callable[..., LinearGaussian]
-"""`(old policy, samples, *, ridge, scale, constant) -> new policy`; see `fit_weighted_ml` for the settings.
-An M-step may lack `constant`."""
+_checked_regress = checks.arguments(regress)
 
 
-@checks.arguments
 def weighted_ml(
     policy: LinearGaussian,
     samples: WeightedSamples,
@@ -47,6 +43,8 @@ def weighted_ml(
 
     Source: Abdolmaleki et al. 2016, Eq. 14 and 15.
     """
+    checks.instance("policy", policy, LinearGaussian)
+    checks.instance("samples", samples, WeightedSamples)
     features, theta, weights, _ = samples
     return fit_weighted_ml(
         features, theta, weights, ridge=ridge, scale=scale, start=policy.coef, constant=constant
@@ -135,7 +133,7 @@ class BoundedML:
         checks.instance("policy", policy, LinearGaussian)
         checks.instance("samples", samples, WeightedSamples)
         features, theta, weights, _ = samples
-        fit = regress(
+        fit = _checked_regress(
             features, theta, weights, ridge=ridge, scale=scale, start=policy.coef, constant=constant
         )
         old_chol = policy.cov_chol / fit.size[:, None]

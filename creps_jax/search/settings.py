@@ -11,15 +11,15 @@ import numpy as np
 from jax.core import Tracer
 
 from creps_jax import checks
-from creps_jax.policies.base import Policy
+from creps_jax.policies.base import MStep, Policy
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.gaussian import linear_gaussian
 from creps_jax.programs import KeepsPrograms
-from creps_jax.search.fit import MStep, bounded_ml, weighted_ml
+from creps_jax.search.fit import bounded_ml, weighted_ml
 from creps_jax.search.importance import Importance
 from creps_jax.typing import ScalarLike
 
-__all__ = ["CrepsSettings", "Programs", "check_features", "checked_kl_bound", "policy_kind"]
+__all__ = ["CrepsSettings", "Programs", "checked_kl_bound", "checked_settings", "policy_kind"]
 
 
 class Programs(dict[Any, Callable]):
@@ -69,8 +69,42 @@ def checked_kl_bound(kl_bound: ScalarLike) -> ScalarLike:
     return kl_bound if isinstance(kl_bound, Tracer) else np.float32(kl_bound)
 
 
-def check_features(name: str, features: FeatureMap) -> None:
-    """Refuse features whose fields are of the wrong type or do not fit each other."""
+@checks.arguments
+def checked_settings(
+    *,
+    kind: Policy,
+    baseline_features: FeatureMap,
+    kl_bound: ScalarLike,
+    archive_size: int | None,
+    importance: Importance | None,
+    significance: float | int | None,
+) -> CrepsSettings:
+    """Return settings, after checking each of them and that they fit each other.
+
+    Raises:
+        ValueError: If a setting is out of its range, or the features are of different contexts.
+    """
+    kl_bound = checked_kl_bound(kl_bound)
+    if significance is not None and not 0 < significance <= 1:
+        raise ValueError(f"significance must be above 0 and at most 1, or None, got {significance}")
+    for name in ("mean", "sample", "log_prob", "kl", "entropy", "fit"):
+        checks.function(f"policy_features.{name}", getattr(kind, name), "see Policy")
+    _check_features("policy_features", kind.features)
+    _check_features("baseline_features", baseline_features)
+    if kind.features.context_dim != baseline_features.context_dim:
+        raise ValueError(
+            "policy_features and baseline_features must be of the same context, got "
+            f"{kind.features.context_dim} and {baseline_features.context_dim} variables"
+        )
+    if significance is not None and kind.blend is None:
+        raise ValueError(
+            f"significance must be None for a policy that has no function blend, got {significance}"
+        )
+    return CrepsSettings(kind, baseline_features, kl_bound, archive_size, importance, significance)
+
+
+def _check_features(name: str, features: FeatureMap) -> None:
+    """Check that the fields of features have the right types and fit each other."""
     checks.function(f"{name}.apply", features.apply, "(context) -> features")
     size = checks.count(f"{name}.size", features.size)
     checks.count(f"{name}.context_dim", features.context_dim)
@@ -86,8 +120,6 @@ def policy_kind(given: FeatureMap | Policy, ridge: float | int | None, m_step: M
         if ridge is not None or m_step is not None:
             raise ValueError(f"ridge and m_step must be None for a Policy, got {ridge} and {m_step}")
         checks.instance("policy_features.features", given.features, FeatureMap)
-        for name in ("mean", "sample", "log_prob", "kl", "entropy", "fit"):
-            checks.function(f"policy_features.{name}", getattr(given, name), "see Policy")
         return given
     if m_step is bounded_ml:
         raise ValueError(

@@ -319,6 +319,20 @@ def test_an_m_step_need_not_take_the_constant():
     assert given == [(0.1, None)]
 
 
+def test_an_m_step_with_any_settings_gets_the_constant():
+    given = []
+
+    def any_settings(policy, samples, **settings):
+        given.append(settings)
+        return policy
+
+    start = start_policy(linear_features(1), 2)
+    samples = WeightedSamples(jnp.ones((3, 2)), jnp.ones((3, 2)), jnp.full(3, 1 / 3), jnp.ones(3, bool))
+    linear_gaussian(linear_features(1), m_step=any_settings, ridge=0.1).fit(start, samples)
+    assert given[0].keys() == {"ridge", "scale", "constant"}
+    np.testing.assert_array_equal(given[0]["constant"], [1.0, 0.0])
+
+
 @pytest.mark.parametrize("m_step", [weighted_ml, bounded_ml(mean_kl_bound=1e3)], ids=["plain", "bounded"])
 @pytest.mark.parametrize("seen", [0.0, 0.3])
 def test_a_policy_of_one_context_does_not_extrapolate(seen, m_step):

@@ -335,6 +335,35 @@ def test_another_kl_bound_is_checked_as_the_first_one(bad):
         ALGORITHM.with_kl_bound(bad)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kl_bound": -1.0}, "kl_bound must be finite and above 0, got -1"),
+        ({"significance": 7}, "significance must be above 0 and at most 1, or None, got 7"),
+        ({"significance": "x"}, "significance must be a number, got 'x'"),
+        ({"archive_size": "x"}, "archive_size must be a whole number, got 'x'"),
+        ({"importance": 3}, "importance must be of type Importance, got 3"),
+        ({"kind": 3}, "kind must be of type Policy, got 3"),
+        ({"baseline_features": 3}, "baseline_features must be of type FeatureMap, got 3"),
+        ({"baseline_features": linear_features(9)}, "must be of the same context, got 2 and 9 variables"),
+    ],
+)
+def test_changed_settings_are_checked_as_the_first_ones(change, message):
+    with pytest.raises(ValueError, match=message):
+        ALGORITHM.with_settings(**change)
+
+
+def test_changed_settings_hold_the_kl_bound_in_single_precision():
+    assert ALGORITHM.with_settings(kl_bound=0.1).settings.kl_bound.dtype == np.float32
+
+
+def test_an_algorithm_with_another_function_refuses_another_kl_bound():
+    other = dataclasses.replace(ALGORITHM, ask=lambda key, state, contexts: contexts)
+    with pytest.raises(ValueError, match=r"algorithm must be made by creps\(\) to change its settings"):
+        other.with_kl_bound(0.1)
+    assert other.with_traced(other.traced).ask is other.ask
+
+
 def test_equal_rewards_keep_the_policy_however_often_they_are_told():
     state = ALGORITHM.init(START)
     for _ in range(150):
