@@ -28,7 +28,7 @@ FORMAT = "creps_jax policy"
 VERSION = 3
 _READABLE = ("2", "3")
 _CLIP_BEFORE = PENALTY
-"""What files of version 2 call the constraint `clip`."""
+"""The name of the constraint `clip` in files of version 2."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -96,37 +96,44 @@ class Learned:
             ValueError: If there is not a number for each variable, or one is outside the range that the
                 policy was learned for; see `in_range`.
         """
-        if named:
-            names = self.contexts.names
-            if context or set(named) != set(names):
-                raise UserError(f"values must be a number for each of {', '.join(names)}, got {named}")
-            context = tuple(named[name] for name in names)
-        return dict(zip(self.parameters.names, self.theta(*context).tolist(), strict=True))
+        return dict(zip(self.parameters.names, self.theta(*context, **named).tolist(), strict=True))
 
-    def theta(self, *context: Any) -> np.ndarray:
+    def theta(self, *context: Any, **named: Any) -> np.ndarray:
         """Return the parameters for a context as an array (d,), within their bounds.
 
+        Args:
+            context: As in calling.
+            named: As in calling.
+
         Raises:
             ValueError: As calling does.
         """
-        return np.asarray(self.parameters.inside(jnp.asarray(self.mean(*context))))
+        return np.asarray(self.parameters.inside(jnp.asarray(self.mean(*context, **named))))
 
-    def mean(self, *context: Any) -> np.ndarray:
+    def mean(self, *context: Any, **named: Any) -> np.ndarray:
         """Return the mean of the free parameters (d,) for a context, before bounds are applied.
 
+        Args:
+            context: As in calling.
+            named: As in calling.
+
         Raises:
             ValueError: As calling does.
         """
-        numbers = jnp.asarray(self.contexts.checked(_flat(context)), jnp.float32)
+        numbers = jnp.asarray(self.contexts.checked(self._values(context, named)), jnp.float32)
         return np.asarray(self.features(numbers)) @ np.asarray(self.policy.coef)
 
-    def in_range(self, *context: Any) -> bool:
+    def in_range(self, *context: Any, **named: Any) -> bool:
         """Return whether a context is within the range that the policy was learned for.
+
+        Args:
+            context: As in calling.
+            named: As in calling.
 
         Raises:
             ValueError: If there is not a number for each context variable.
         """
-        return self.contexts.contains(_flat(context))
+        return self.contexts.contains(self._values(context, named))
 
     def thetas(self, contexts: Float[Array, "n s"]) -> Float[Array, "n d"]:
         """Return the parameters for many contexts; it can be jitted, and does not check the range."""
@@ -135,6 +142,16 @@ class Learned:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a policy file, see `save`."""
         save(path, self)
+
+    def _values(self, context: tuple[Any, ...], named: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Return the values of a context that was given by position, as one sequence, or by name."""
+        if named:
+            names = self.contexts.names
+            if context or set(named) != set(names):
+                raise UserError(f"values must be a number for each of {', '.join(names)}, got {named}")
+            return tuple(named[name] for name in names)
+        is_sequence = len(context) == 1 and np.ndim(context[0]) == 1 and not isinstance(context[0], str)
+        return tuple(context[0]) if is_sequence else context
 
 
 def save(path: str | os.PathLike[str], learned: Learned) -> None:
@@ -184,10 +201,12 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
     file = _checked_path(path)
     arrays = load_arrays(file)
     if str(arrays.get("format")) != FORMAT:
-        raise UserError(f"{file} is no policy file (its format is not {FORMAT!r})")
+        got = arrays.get("format", "no format")
+        raise UserError(f"{file} must be a policy file of format {FORMAT!r}, got {got}")
     if str(arrays.get("version")) not in _READABLE:
         expected = " or ".join(_READABLE)
-        raise UserError(f"{file} is a policy file of version {arrays.get('version')}, expected {expected}")
+        got = arrays.get("version", "no version")
+        raise UserError(f"{file} must be a policy file of version {expected}, got {got}")
     try:
         context_low, context_high = arrays["context_range"].tolist()
         param_low, param_high = arrays["param_bounds"].tolist()
@@ -204,12 +223,6 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
         raise UserError(f"{file} is an incomplete policy file: it has no {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{file}: {error}") from error
-
-
-def _flat(context: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the numbers of a context, which may be one sequence of them."""
-    is_sequence = len(context) == 1 and np.ndim(context[0]) == 1 and not isinstance(context[0], str)
-    return tuple(context[0]) if is_sequence else context
 
 
 def _space(

@@ -101,9 +101,13 @@ def test_a_context_is_given_by_numbers_a_sequence_or_names():
     for given in ([0.2, 0.7], (0.2, 0.7), np.array([0.2, 0.7])):
         assert policy(given) == expected and policy.in_range(given)
     assert policy(y=0.7, x=0.2) == expected
+    assert policy.in_range(y=0.7, x=0.2) and not policy.in_range(y=1.7, x=0.2)
+    for use in (policy.theta, policy.mean):
+        np.testing.assert_array_equal(use(y=0.7, x=0.2), use(0.2, 0.7))
     for arguments, named in (((0.2,), {"y": 0.7}), ((), {"x": 0.2}), ((), {"x": 0.2, "y": 0.7, "z": 1.0})):
-        with pytest.raises(ValueError, match="values must be a number for each of x, y, got"):
-            policy(*arguments, **named)
+        for use in (policy, policy.theta, policy.mean, policy.in_range):
+            with pytest.raises(ValueError, match="values must be a number for each of x, y, got"):
+                use(*arguments, **named)
 
 
 def test_bounds_are_held_unless_asked_otherwise():
@@ -232,12 +236,12 @@ def test_a_policy_file_is_named_as_what_it_is(tmp_path):
 def test_foreign_files_and_other_versions_are_refused(tmp_path):
     path = tmp_path / "policy.npz"
     files.save_arrays(path, {"coef": np.zeros((4, 2))})
-    with pytest.raises(UserError, match="no policy file"):
+    with pytest.raises(UserError, match="must be a policy file of format 'creps_jax policy', got no format"):
         load(path)
     save(path, make_policy())
     whole = files.load_arrays(path)
     files.save_arrays(path, {**whole, "version": 1})
-    with pytest.raises(UserError, match="version 1, expected 2 or 3"):
+    with pytest.raises(UserError, match="must be a policy file of version 2 or 3, got 1"):
         load(path)
     for name in whole.keys() - {"format", "version"}:
         files.save_arrays(path, {key: values for key, values in whole.items() if key != name})
