@@ -1,5 +1,5 @@
 from . import numerics, policies, robots, search, simulation, tasks, walking
-from .contexts import context_grid, gaussian_contexts, uniform_contexts
+from .contexts import context_grid, ellipsoid_contexts, gaussian_contexts, uniform_contexts
 from .numerics.linalg import thomas_solve
 from .policies.base import Policy, WeightedSamples
 from .policies.features import (
@@ -22,9 +22,12 @@ from .search.importance import Importance
 from .tasks.base import Outcome, PlainOutcome, Task, average_repeats, penalised, sigmoid_constrained
 from .tasks.planar_arm import hole_reaching, via_point_reaching
 from .tasks.sine import sinus
+from .tasks.steering import nao_steered_walk
 from .tasks.walking import nao_walk
 from .training import IterationLog, evaluate, learned, make_iteration, train, train_trials
 from .walking.com import com_trajectory
+from .walking.controller import Walker
+from .walking.gaits import learned_walker
 from .walking.params import NAO_BOUNDS
 
 __version__: str
@@ -48,23 +51,27 @@ __all__ = [
     "Search",
     "Space",
     "Task",
+    "Walker",
     "WeightedSamples",
     "average_repeats",
     "bounded_ml",
     "com_trajectory",
     "context_grid",
     "creps",
+    "ellipsoid_contexts",
     "evaluate",
     "fit_weighted_ml",
     "gaussian_contexts",
     "hole_reaching",
     "learned",
+    "learned_walker",
     "leg_fk",
     "leg_ik",
     "linear_features",
     "linear_gaussian",
     "load",
     "make_iteration",
+    "nao_steered_walk",
     "nao_walk",
     "numerics",
     "penalised",

@@ -10,7 +10,7 @@ import numpy as np
 from creps_jax import checks
 from creps_jax.typing import Array, Float, PRNGKey, VectorLike
 
-__all__ = ["context_grid", "gaussian_contexts", "uniform_contexts"]
+__all__ = ["context_grid", "ellipsoid_contexts", "gaussian_contexts", "uniform_contexts"]
 
 Sampler = Callable[[PRNGKey], Array]
 """(key) -> context (s,)."""
@@ -62,6 +62,22 @@ def uniform_contexts(low: VectorLike, high: VectorLike) -> Sampler:
         ValueError: If the ends do not fit each other.
     """
     return _Uniform(*map(_numbers, _checked_range(low, high)))
+
+
+def ellipsoid_contexts(low: VectorLike, high: VectorLike) -> Sampler:
+    """Draw contexts evenly from the ellipsoid that touches the sides of a box.
+
+    Args:
+        low: Lower end of each context's range; a number is a context of one dimension.
+        high: Upper end of each context's range.
+
+    Returns:
+        A function (key) -> context (s,).
+
+    Raises:
+        ValueError: If the ends do not fit each other.
+    """
+    return _Ellipsoid(*map(_numbers, _checked_range(low, high)))
 
 
 @checks.arguments
@@ -118,6 +134,23 @@ class _Uniform:
         low, high = _vector(self.low), _vector(self.high)
         half = _halves(low, high)
         return jax.random.uniform(key, low.shape, minval=low * half, maxval=high * half) / half
+
+
+@dataclasses.dataclass(frozen=True)
+class _Ellipsoid:
+    """Draw evenly from the ellipsoid inside a range."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+    @checks.arguments
+    def __call__(self, key: PRNGKey) -> Float[Array, " s"]:
+        low, high = _vector(self.low), _vector(self.high)
+        direction_key, radius_key = jax.random.split(key)
+        direction = jax.random.normal(direction_key, low.shape)
+        direction = direction / jnp.maximum(jnp.linalg.norm(direction), checks.FLOAT32_TINY)
+        radius = jax.random.uniform(radius_key) ** (1.0 / low.size)
+        return jnp.clip(low / 2 + high / 2 + (high / 2 - low / 2) * radius * direction, low, high)
 
 
 def _halves(low: np.ndarray, high: np.ndarray) -> np.ndarray:

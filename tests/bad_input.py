@@ -27,6 +27,7 @@ from hypothesis import strategies as st
 
 import creps_jax as cj
 from creps_jax import tasks
+from creps_jax.files import policies_folder
 from creps_jax.numerics import rotations
 from creps_jax.policies.features import polynomial_features
 from creps_jax.robots import nao_geometry
@@ -37,8 +38,9 @@ from creps_jax.search.fit import WeightedSamples, fit_within, weighted_ml
 from creps_jax.simulation import c, mjx, models
 from creps_jax.simulation.models import load_nao
 from creps_jax.tasks import conditions, dmp, functions, planar_arm
+from creps_jax.tasks.steering import SteeringReward, record_drive
 from creps_jax.tasks.walking import WalkNoise, WalkReward, record_walk
-from creps_jax.walking import com, engine, footsteps, params, posture, set_points, swing, zmp
+from creps_jax.walking import com, engine, footsteps, gaits, params, posture, set_points, swing, zmp
 from creps_jax.walking.posture import Balance
 
 # What of an argument an error names, where it is a part of it.
@@ -331,6 +333,8 @@ RUN = {
 SPACES = cj.Space("x", 0.0, 1.0), cj.Space(("a", "b"), (0.0, 0.0), (1.0, 1.0))
 SPEED = cj.Space(("speed",), (0.0,), (1.0,), ("m/s",))
 LEARNED = cj.Learned(POLICY, FEATURES, SPEED, SPACES[1])
+STRAIGHT = cj.load(policies_folder() / "walk.npz")
+WALKER = cj.learned_walker(STRAIGHT)
 FOLDER = Path(tempfile.mkdtemp())
 LEARNED.save(FOLDER / "policy.npz")
 NO_PATH = one_of((None, "None"), (5, "5"), (["a"], "['a']"))
@@ -368,7 +372,22 @@ OF_VECTORS = (
 
 
 # Called with what a public function has checked, or for each robot in each step, where checks cost time.
-INNER = {"changed_fields", "initial_state", "leg_reach", "read_servos", "substep_shares", "world_of"}
+INNER = {
+    "com_heights",
+    "com_velocities",
+    "compose",
+    "continuous_com_trajectory",
+    "limited_command",
+    "relative_pose",
+    "wrapped",
+    "zmp_shares",
+    "changed_fields",
+    "initial_state",
+    "leg_reach",
+    "read_servos",
+    "substep_shares",
+    "world_of",
+}
 
 
 class Done(Exception):
@@ -388,6 +407,12 @@ def before_physics(**given: Any) -> None:
     """Record a walk, but for its physics and what comes after."""
     with contextlib.suppress(Done):
         record_walk(**given)
+
+
+def before_driving(**given: Any) -> None:
+    """Record a drive, but for its physics and what comes after."""
+    with contextlib.suppress(Done):
+        record_drive(**given)
 
 
 MOTION = {
@@ -497,6 +522,16 @@ PHYSICS = {
         duration=number(8.0, above=0.0),
         noise=record(WalkNoise(), lean=number(0.01, least=0.0)),
         balance=record(Balance(), heading_gain=number(0.0)),
+        conditions=Argument((), NONSENSE | one_of((3, "3"))),
+        model=optional(record(MODEL)),
+        physics=function(stop),
+    ),
+    "record_drive": made(
+        before_driving,
+        key=key(KEY),
+        walker=record(WALKER, (dataclasses.replace(WALKER, period=0.01), "0.01")),
+        commands=array(np.zeros((5, 3)), free=(0,), bears=ANY),
+        noise=record(WalkNoise(), lean=number(0.01, least=0.0)),
         conditions=Argument((), NONSENSE | one_of((3, "3"))),
         model=optional(record(MODEL)),
         physics=function(stop),
@@ -666,6 +701,25 @@ ROWS = {
         state=state(),
         made_for=optional(Argument({}, one_of((5, "5"), ("walk", "walk")))),
     ),
+    "ellipsoid_contexts": row(cj.ellipsoid_contexts, use=use_sampler, low=vector(0.0), high=vector(1.0)),
+    "ellipsoid_contexts()": row(cj.ellipsoid_contexts(0.0, 1.0), key=key(KEY)),
+    "learned_walker": row(
+        cj.learned_walker,
+        use=lambda walker: walker.period,
+        learned=record(STRAIGHT, (LEARNED, "speed, or vx, vy, turn")),
+    ),
+    "Walker": row(
+        cj.Walker,
+        use=lambda walker: walker.period,
+        gait=function(lambda command: None),
+        robot=record(NAO),
+        period=number(0.02, above=0.0),
+        balance=record(Balance()),
+        acceleration=vector((0.4, 0.4, 2.0)),
+        com=Argument("one_step", one_of(("two", "'two'"), (None, "None"), (3, "3"))),
+    ),
+    "steered_gait": traced(gaits.steered_gait, theta=array(np.ones(12), bears=ANY)),
+    "straight_gait": traced(gaits.straight_gait, theta=array(np.ones(10), bears=ANY)),
     "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
     "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),
     "make_iteration": row(
@@ -694,6 +748,25 @@ ROWS = {
         robot=record(NAO, (NAO_H25, "range of the robot nao_h25")),
         model=optional(record(MODEL, (load_nao(NAO_H25), "-2.086 to 2.086"))),
         physics=function(lambda model, num_steps: None),
+    ),
+    "nao_steered_walk": row(
+        cj.nao_steered_walk,
+        use=lambda task: (task.sample_context(KEY), task.worst_reward),
+        low=Argument((-0.2, -0.1, -0.8), NONSENSE),
+        high=Argument((0.6, 0.1, 0.8), NONSENSE),
+        profile=Argument(((0.0, 1.0, 1.0),), NONSENSE | one_of((((1.0, 1.0),), "((1.0, 1.0),)"))),
+        duration=number(5.0),
+        start_up=number(2.0, least=0.0),
+        reward=record(SteeringReward(), speed=number(10.0, least=0.0)),
+        noise=record(WalkNoise(), lean=number(0.01, least=0.0)),
+        balance=record(Balance(), heading_gain=number(0.0)),
+        conditions=Argument((), NONSENSE | one_of((3, "3"))),
+        sample_context=function(cj.uniform_contexts((0.0,) * 3, (1.0,) * 3)),
+        robot=record(NAO, (NAO_H25, "range of the robot nao_h25")),
+        model=optional(record(MODEL, (load_nao(NAO_H25), "-2.086 to 2.086"))),
+        physics=function(lambda model, num_steps: None),
+        acceleration=vector((0.4, 0.4, 2.0)),
+        com=Argument("one_step", one_of(("two", "'two'"), (None, "None"), (3, "3"))),
     ),
     "penalised": row(
         cj.penalised,

@@ -1,5 +1,6 @@
 """Hold every feature map, context sampler and task to what the library expects of one."""
 
+import inspect
 import subprocess
 import sys
 
@@ -147,5 +148,6 @@ def test_mujoco_is_imported_only_for_the_walking_task_which_stays_a_function(ord
     assert result.returncode == 0, result.stderr
 
 
-def test_the_library_has_at_most_sixty_names():
-    assert len(creps_jax.__all__) == len(set(creps_jax.__all__)) <= 60
+def test_the_library_has_at_most_sixty_names_besides_its_modules():
+    names = [name for name in creps_jax.__all__ if not inspect.ismodule(getattr(creps_jax, name))]
+    assert len(names) == len(set(names)) <= 60

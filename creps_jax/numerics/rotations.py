@@ -12,6 +12,8 @@ Conventions, used everywhere in the library:
 Values and gradients are finite at gimbal lock and for a zero quaternion too.
 """
 
+import math
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -29,6 +31,7 @@ __all__ = [
     "rpy_to_matrix",
     "rpy_to_quat",
     "safe_arctan2",
+    "wrapped",
 ]
 
 _TINY = 1e-12
@@ -131,3 +134,9 @@ def _rotation_entries(angle: ScalarLike) -> tuple[Float[Array, ""], ...]:
     """Return the cosine and sine of `angle`, and zero and one of the same type."""
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     return cosine, sine, jnp.zeros_like(cosine), jnp.ones_like(cosine)
+
+
+def wrapped(angle: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Return an angle, rad, as the equal one from -pi to pi; one in this range is returned to the bit."""
+    turns = jnp.round(angle / (2.0 * math.pi))
+    return angle - 2.0 * math.pi * turns

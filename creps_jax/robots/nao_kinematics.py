@@ -43,7 +43,8 @@ class _Links(NamedTuple):
         return sqrt(self.thigh**2 + self.shank**2 + 2.0 * self.thigh * self.shank * cos(bend))
 
 
-def _links(robot: Robot) -> _Links:
+def leg_links(robot: Robot) -> _Links:
+    """Return the links of a leg of a robot, m and rad."""
     forward, down = robot.geometry.thigh_forward, robot.geometry.thigh_down
     return _Links(hypot(forward, down), robot.geometry.shank_down, atan2(forward, down))
 
@@ -55,7 +56,7 @@ def leg_reach(robot: Robot = NAO) -> tuple[float, float]:
     stretched.
     """
     knee = leg_indices(LEFT).start + 3
-    links = _links(robot)
+    links = leg_links(robot)
     return links.distance(robot.joint_lower[knee]), links.distance(robot.joint_upper[knee])
 
 
@@ -143,7 +144,7 @@ def leg_ik(
     """
     checks.finite("T_torso_sole", T_torso_sole)
     side = _checked_side(side, T_torso_sole.dtype)
-    g, links, reach = robot.geometry, _links(robot), leg_reach(robot)
+    g, links, reach = robot.geometry, leg_links(robot), leg_reach(robot)
     if yaw_pitch is not None:
         if g.ankle_drop != 0.0:
             raise ValueError(f"yaw_pitch must be None for a robot of ankle_drop above 0, got {yaw_pitch!r}")
@@ -179,7 +180,7 @@ def _solve_with_yaw_pitch(
     hip_roll = safe_arctan2(y, -z)
     # Solved for a sole perpendicular to the leg's plane; knee and ankle turn the thigh from there.
     knee, square = _solve_plane(
-        -x, jnp.sin(hip_roll) * y - jnp.cos(hip_roll) * z, _links(robot), leg_reach(robot)
+        -x, jnp.sin(hip_roll) * y - jnp.cos(hip_roll) * z, leg_links(robot), leg_reach(robot)
     )
     R_torso_shank = R_torso_pelvis @ rotation_x(hip_roll) @ rotation_y(square)
     x, y, z = R_torso_shank.T @ up

@@ -38,6 +38,9 @@ class Robot:
         com_ahead_of_hip: Forward distance of the centre of mass from the middle of the hips, m.
         zmp_ahead_of_ankle: Forward distance of the planned zero moment point from the ankle of a foot, m.
         has_one_yaw_motor: Whether one motor drives the hip yaw-pitch of both legs, which are then equal.
+        own_names: Names of the joints in the robot's own software, in the order of
+            `nao_geometry.JOINT_NAMES`.
+        own_signs: +1 or -1 for each joint: angles times these have the signs of the robot's own software.
 
     Raises:
         ValueError: If there is not one limit, speed or torque for each joint, limits are not in order, or
@@ -54,9 +57,18 @@ class Robot:
     com_ahead_of_hip: float
     zmp_ahead_of_ankle: float
     has_one_yaw_motor: bool = False
+    own_names: tuple[str, ...] = JOINT_NAMES
+    own_signs: tuple[float, ...] = (1.0,) * NUM_JOINTS
 
     def __post_init__(self) -> None:
-        for name in ("joint_lower", "joint_upper", "max_joint_speed", "max_joint_torque"):
+        for name in (
+            "joint_lower",
+            "joint_upper",
+            "max_joint_speed",
+            "max_joint_torque",
+            "own_names",
+            "own_signs",
+        ):
             if len(getattr(self, name)) != NUM_JOINTS:
                 raise ValueError(f"{name} must have {NUM_JOINTS} entries, got {len(getattr(self, name))}")
         for name, low, high in zip(JOINT_NAMES, self.joint_lower, self.joint_upper, strict=True):
@@ -103,6 +115,32 @@ _H25_LEFT_LEG = (_H25_YAW_PITCH, (-21.74, 45.29), *_H25_PITCHES, (-22.79, 44.06)
 _H25_RIGHT_LEG = (_H25_YAW_PITCH, (-45.29, 21.74), *_H25_PITCHES, (-44.06, 22.79))
 _H25_RANGES = (*_H25_HEAD, *_H25_LEFT_ARM, *_H25_RIGHT_ARM, *_H25_LEFT_LEG, *_H25_RIGHT_LEG)
 
+# The names of Aldebaran's SDK, and its signs, which are opposite to those of the simulation for some joints.
+_H25_OWN = {
+    "head_yaw": ("HeadYaw", 1.0),
+    "head_pitch": ("HeadPitch", -1.0),
+    "shoulder_pitch": ("ShoulderPitch", -1.0),
+    "shoulder_yaw": ("ShoulderRoll", 1.0),
+    "arm_roll": ("ElbowYaw", 1.0),
+    "elbow": ("ElbowRoll", 1.0),
+    "hip_yaw_pitch": ("HipYawPitch", 1.0),
+    "hip_roll": ("HipRoll", 1.0),
+    "hip_pitch": ("HipPitch", -1.0),
+    "knee": ("KneePitch", -1.0),
+    "ankle_pitch": ("AnklePitch", -1.0),
+    "ankle_roll": ("AnkleRoll", 1.0),
+}
+
+
+def _h25_own(joint: str) -> tuple[str, float]:
+    """Return name and sign of a joint of the real NAO in its own software."""
+    side, _, part = joint.partition("_")
+    if side not in ("left", "right"):
+        return _H25_OWN[joint]
+    name, sign = _H25_OWN[part]
+    return side[0].upper() + name, sign
+
+
 NAO_H25 = Robot(
     name="nao_h25",
     geometry=NaoGeometry(
@@ -134,6 +172,8 @@ NAO_H25 = Robot(
     com_ahead_of_hip=0.01,
     zmp_ahead_of_ankle=0.02,
     has_one_yaw_motor=True,
+    own_names=tuple(_h25_own(name)[0] for name in JOINT_NAMES),
+    own_signs=tuple(_h25_own(name)[1] for name in JOINT_NAMES),
 )
 """The real NAO, H25; `models/nao_h25/SOURCE.md` names the sources of its values.
 

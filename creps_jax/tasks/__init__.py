@@ -1,6 +1,6 @@
 """Tasks to learn, and wrappers from task to task.
 
-`nao_walk` needs MuJoCo, which is imported when `nao_walk` is first accessed.
+The walks need MuJoCo, which is imported when one of them is first accessed.
 """
 
 import importlib
@@ -19,6 +19,7 @@ from creps_jax.tasks.planar_arm import hole_reaching, via_point_reaching
 from creps_jax.tasks.sine import sinus
 
 if TYPE_CHECKING:
+    from creps_jax.tasks.steering import nao_steered_walk
     from creps_jax.tasks.walking import nao_walk
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "average_repeats",
     "contextual_function",
     "hole_reaching",
+    "nao_steered_walk",
     "nao_walk",
     "penalised",
     "sigmoid_constrained",
@@ -36,7 +38,10 @@ __all__ = [
 ]
 
 
+_WALKS = {"nao_steered_walk": "steering", "nao_walk": "walking"}
+
+
 def __getattr__(name: str) -> Any:
-    if name != "nao_walk":
+    if name not in _WALKS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return importlib.import_module("creps_jax.tasks.walking").nao_walk
+    return getattr(importlib.import_module(f"creps_jax.tasks.{_WALKS[name]}"), name)

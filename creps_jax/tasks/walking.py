@@ -19,23 +19,29 @@ from creps_jax.simulation.state import Physics
 from creps_jax.tasks.base import Task
 from creps_jax.tasks.closed_loop import (
     CONTROL_PERIOD,
-    PlannedWalk,
+    Walk,
     WalkNoise,
     WalkSetup,
     WalkState,
     advance,
+    begin,
     check_numbers,
     is_fallen,
     make_setup,
-    plan,
 )
 from creps_jax.tasks.conditions import Condition
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar
+from creps_jax.walking.controller import Walker
 from creps_jax.walking.engine import BodyPose
+from creps_jax.walking.gaits import straight_gait
 from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS
 from creps_jax.walking.posture import Balance
 
 __all__ = ["WalkOutcome", "WalkRecord", "WalkReward", "nao_walk", "record_walk"]
+
+
+# Acceleration of a command that is followed at once.
+_AT_ONCE = (1e6, 1e6, 1e6)
 
 
 class WalkReward(NamedTuple):
@@ -158,7 +164,8 @@ def nao_walk(
         raise ValueError(
             f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
         )
-    setup = make_setup(robot, model, duration, noise, balance, conditions, physics)
+    check_numbers("balance", balance)
+    setup = make_setup(robot, model, duration, noise, conditions, physics)
     if sample_context is None:
         lows, highs = [low, *(c.low for c in conditions)], [high, *(c.high for c in conditions)]
         sample_context = gaussian_contexts(lows, highs, clip=True)
@@ -168,8 +175,9 @@ def nao_walk(
     @checks.arguments
     def rollout(key: PRNGKey, context: Array, theta: Float[Array, "10"]) -> WalkOutcome:
         context = checks.array("context", context, (context_dim,))
-        walk, start = plan(setup, key, theta, context[1:])
-        end = _walk_to_end(setup, walk, start, start_up_ticks)
+        walker = _straight_walker(theta, robot, balance)
+        walk, start = begin(setup, walker, key, context[1:])
+        end = _walk_to_end(setup, walker, walk, start, start_up_ticks)
         return _measure(end, start_up_ticks, context[0], reward)
 
     # A fall at twice the highest speed in the wrong direction.
@@ -219,24 +227,39 @@ def record_walk(
     Raises:
         ValueError: If there is not one value for each condition.
     """
-    setup = make_setup(robot, model, duration, noise, balance, conditions, physics)
+    check_numbers("balance", balance)
+    setup = make_setup(robot, model, duration, noise, conditions, physics)
     values = jnp.zeros(0, theta.dtype) if values is None else values
     values = checks.array("values", values, (len(conditions),), note=", one for each of the conditions")
-    walk, start = plan(setup, key, theta, values)
+    walker = _straight_walker(theta, robot, balance)
+    walk, start = begin(setup, walker, key, values)
 
     def step(carry, tick):
         state, has_fallen = carry
-        state = advance(setup, walk, tick, state)
+        state = advance(setup, walker, walk, tick, state, _ahead(theta.dtype))
         has_fallen = has_fallen | is_fallen(setup, walk, state)
-        return (state, has_fallen), (state.robot.qpos, state.set_point, has_fallen)
+        pose = walker.pose(state.walker, walk.slope)
+        return (state, has_fallen), (state.robot.qpos, state.walker.set_point, pose, has_fallen)
 
     ticks = jnp.arange(setup.num_ticks, dtype=jnp.int32)
-    _, (qpos, set_point, has_fallen) = lax.scan(step, (start, jnp.asarray(False)), ticks)
+    _, (qpos, set_point, pose, has_fallen) = lax.scan(step, (start, jnp.asarray(False)), ticks)
     time = (ticks + 1).astype(theta.dtype) * CONTROL_PERIOD
-    return WalkRecord(time, qpos, set_point, walk.poses, has_fallen)
+    return WalkRecord(time, qpos, set_point, pose, has_fallen)
 
 
-def _walk_to_end(setup: WalkSetup, walk: PlannedWalk, start: WalkState, start_up_ticks: int) -> _Progress:
+def _straight_walker(theta: Float[Array, "10"], robot: Robot, balance: Balance) -> Walker:
+    """Return the walker of the paper: straight ahead from the first control step on, each step by itself."""
+    return Walker(lambda _: straight_gait(theta), robot, CONTROL_PERIOD, balance, _AT_ONCE, "one_step")
+
+
+def _ahead(dtype: jnp.dtype) -> Float[Array, "3"]:
+    """Return a command straight ahead: the gait, not the command, says how fast."""
+    return jnp.array([1.0, 0.0, 0.0], dtype)
+
+
+def _walk_to_end(
+    setup: WalkSetup, walker: Walker, walk: Walk, start: WalkState, start_up_ticks: int
+) -> _Progress:
     """Walk until the episode ends or the robot falls."""
 
     def is_walking(progress: _Progress) -> Array:
@@ -246,7 +269,8 @@ def _walk_to_end(setup: WalkSetup, walk: PlannedWalk, start: WalkState, start_up
         # A batch continues until all its robots have finished. A state of NaN makes C MuJoCo skip a robot
         # that has fallen.
         robot = jax.tree.map(lambda x: jnp.where(progress.has_fallen, jnp.nan, x), progress.state.robot)
-        state = advance(setup, walk, progress.tick, progress.state._replace(robot=robot))
+        state = progress.state._replace(robot=robot)
+        state = advance(setup, walker, walk, progress.tick, state, _ahead(start.robot.qpos.dtype))
         tick = progress.tick + 1
         is_start_up = tick <= start_up_ticks
         measured_from = lax.select(is_start_up, state.robot.qpos[:2], progress.measured_from)

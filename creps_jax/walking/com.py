@@ -9,7 +9,7 @@ from creps_jax.numerics.linalg import thomas_solve
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 from creps_jax.walking.params import GRAVITY
 
-__all__ = ["com_trajectory", "spring_height", "zmp_of_com"]
+__all__ = ["com_trajectory", "com_velocities", "continuous_com_trajectory", "spring_height", "zmp_of_com"]
 
 
 @checks.arguments
@@ -98,3 +98,93 @@ def zmp_of_com(
     # In print: x_ZMP = x - x'' z / (g + z'')
     difference = com[:-2] - 2.0 * com[1:-1] + com[2:]  # Eq. 5
     return com[1:-1] + weight * difference  # Eq. 1
+
+
+def com_velocities(
+    com: Float[Array, " n"],
+    zmp: Float[Array, " n"],
+    com_height: Float[Array, " n"],
+    com_height_acc: Float[Array, " n"],
+    duration: ScalarLike,
+) -> Float[Array, "2"]:
+    """Return the velocity of a CoM trajectory at its first and its last node.
+
+    The velocities are those for which Eq. 1 holds at these two nodes as well, so that a trajectory that
+    begins with the last velocity of another one continues it.
+
+    Args:
+        com: CoM position at the nodes along one horizontal axis, m.
+        zmp: ZMP at the nodes, m.
+        com_height: CoM height, m.
+        com_height_acc: Vertical CoM acceleration, m/s^2.
+        duration: Duration of the step, s.
+
+    Returns:
+        First and last velocity, m/s.
+    """
+    period = duration / (com.shape[0] - 1)
+    ends = jnp.array([0, -1])
+    acceleration = _pendulum_rate(com_height, com_height_acc)[ends] * (com - zmp)[ends]
+    first, last = (com[1] - com[0]) / period, (com[-1] - com[-2]) / period
+    half = 0.5 * period * acceleration
+    return jnp.stack([first - half[0], last + half[1]])
+
+
+def continuous_com_trajectory(
+    zmp: Float[Array, " n"],
+    shift_shape: Float[Array, " n"],
+    com_height: Float[Array, " n"],
+    com_height_acc: Float[Array, " n"],
+    start: Float[Array, "2"],
+    end: Float[Array, "2"],
+    duration: ScalarLike,
+    largest_shift: ScalarLike,
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Find the CoM trajectory that continues a given position and velocity, and can be continued itself.
+
+    The motion of the pendulum has a part that decays and a part that grows, the divergent component
+    `x + x' / omega`. The trajectory begins with the position and velocity of `start`, and its divergent
+    component ends where that of `end` is; the decaying part takes care of itself. These are three conditions
+    for an equation of second order. The third is met by a shift of the ZMP reference along `shift_shape`.
+
+    Args:
+        zmp: ZMP reference along one horizontal axis, m.
+        shift_shape: How much of the shift each node gets, 0 to 1; 0 at the last node.
+        com_height: CoM height above the floor, m; positive.
+        com_height_acc: Vertical CoM acceleration, m/s^2; greater than -g everywhere.
+        start: CoM position (m) and velocity (m/s) at the first node.
+        end: Position and velocity whose divergent component is to be reached at the last node.
+        duration: Duration of the step, s.
+        largest_shift: Limit of the shift, m. Where it is reached, the velocity is not continuous.
+
+    Returns:
+        CoM position at the nodes, and the ZMP that belongs to it, m.
+
+    Source: Abdolmaleki et al. 2016, Eq. 1 and 5; Englsberger, Ott and Albu-Schaeffer 2015, Three-dimensional
+    bipedal walking control based on divergent component of motion, for the condition at the end.
+    """
+    period = duration / (zmp.shape[0] - 1)
+    step = period * jnp.sqrt(_pendulum_rate(com_height, com_height_acc)[-1])  # omega times the period
+    weight = _neighbour_weight(com_height, com_height_acc, duration)
+    upper = weight.at[jnp.array([0, -1])].set(0.0)
+    # Last row: x + x' / omega with the last velocity of `com_velocities`.
+    lower = upper.at[-1].set(-1.0 / step)
+    diag = (1.0 - 2.0 * upper).at[-1].set(1.0 + 1.0 / step + 0.5 * step)
+
+    def solve(reference, position, divergent):
+        rhs = reference.at[0].set(position).at[-1].set(divergent + 0.5 * step * reference[-1])
+        return thomas_solve(lower, diag, upper, rhs)
+
+    def first_velocity(com, reference):
+        return com_velocities(com, reference, com_height, com_height_acc, duration)[0]
+
+    planned = solve(zmp, start[0], end[0] + end[1] * period / step)
+    change = solve(shift_shape, 0.0, 0.0)
+    shift = (start[1] - first_velocity(planned, zmp)) / first_velocity(change, shift_shape)
+    shift = jnp.clip(shift, -largest_shift, largest_shift)
+    return planned + shift * change, zmp + shift * shift_shape
+
+
+def _pendulum_rate(com_height, com_height_acc):
+    """Return omega^2 of the pendulum, 1/s^2: the horizontal acceleration for each metre from the ZMP."""
+    return (GRAVITY + com_height_acc) / com_height

@@ -9,7 +9,7 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.numerics.curves import smooth_step
-from creps_jax.numerics.rotations import rigid_transform, rotation_x, rotation_y, rotation_z
+from creps_jax.numerics.rotations import rigid_transform, rotation_x, rotation_y, rotation_z, wrapped
 from creps_jax.robots.nao_geometry import LEFT, RIGHT, leg_indices
 from creps_jax.robots.nao_kinematics import leg_ik
 from creps_jax.robots.robot import NAO, Robot
@@ -25,6 +25,7 @@ __all__ = [
     "BodyPose",
     "StepPlan",
     "body_pose",
+    "com_heights",
     "joint_targets",
     "plan_step",
     "plan_walk",
@@ -36,14 +37,14 @@ __all__ = [
 NUM_NODES = 33
 # Swing of the shoulders against the legs, rad for each metre that the other foot is ahead, and the arms'
 # posture, rad.
-_ARM_SWING = 5.0
-_SHOULDER_PITCH = -1.6
-_SHOULDER_YAW = 0.1
-_ARM_ROLL = 1.57
-_ELBOW = 0.6
-_MAX_HEADING_STEP = 0.15
+ARM_SWING = 5.0
+SHOULDER_PITCH = -1.6
+SHOULDER_YAW = 0.1
+ARM_ROLL = 1.57
+ELBOW = 0.6
+MAX_HEADING_STEP = 0.15
 # Sideways tilt beyond which a foot is put out no further, rad.
-_MAX_TILT = 0.35
+MAX_TILT = 0.35
 
 
 class StepPlan(NamedTuple):
@@ -99,12 +100,18 @@ def plan_step(
     phase = jnp.linspace(0.0, 1.0, NUM_NODES, dtype=command.dtype)
     share = params.double_support / params.step_duration
     zmp = zmp_reference(phase, start[:2], footstep.support[:2], end[:2], share)
-    height, height_acc = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
-    com_height = height + (robot.geometry.ankle_height + robot.com_above_hip)
+    com_height, height_acc = com_heights(params, robot=robot)
     solve = jax.vmap(com_trajectory, in_axes=(1, None, None, 0, 0, None), out_axes=1)
     # Along x and, by Eq. 2 in place of Eq. 1, along y.
     com = solve(zmp, com_height, height_acc, start[:2], end[:2], params.step_duration)  # Eq. 2
     return StepPlan(footstep, com, jnp.stack([start[2], end[2]])), after
+
+
+def com_heights(params: WalkParams, *, robot: Robot = NAO) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return height (m) and vertical acceleration (m/s^2) of the CoM at the nodes of a step."""
+    phase = jnp.linspace(0.0, 1.0, NUM_NODES, dtype=params.hip_height.dtype)
+    height, height_acc = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
+    return height + (robot.geometry.ankle_height + robot.com_above_hip), height_acc
 
 
 @checks.arguments
@@ -225,10 +232,10 @@ def pose_joints(
     intended = jnp.stack([jnp.zeros_like(params.lean), params.lean])
     roll, pitch = corrected_lean(intended, measured_rpy[:2], params.roll_gain, params.tilt_gain)
     R_level_trunk = rotation_y(pitch) @ rotation_x(roll)
-    heading_error = jnp.clip(pose.hips[3] - measured_rpy[2], -1.0, 1.0)
+    heading_error = jnp.clip(wrapped(pose.hips[3] - measured_rpy[2]), -1.0, 1.0)
     heading_step = balance.heading_gain * heading_error
-    turn = jnp.clip(heading_step, -_MAX_HEADING_STEP, _MAX_HEADING_STEP) * pose.turn
-    tilt = jnp.clip(measured_rpy[0], -_MAX_TILT, _MAX_TILT)
+    turn = jnp.clip(heading_step, -MAX_HEADING_STEP, MAX_HEADING_STEP) * pose.turn
+    tilt = jnp.clip(measured_rpy[0], -MAX_TILT, MAX_TILT)
     aside = -balance.placement_gain * params.hip_height * tilt
     aside_left, aside_right = aside * (0.5 + pose.turn), aside * (0.5 - pose.turn)
     place = partial(_sole_in_torso, pose.hips, R_level_trunk=R_level_trunk, geometry=robot.geometry)
@@ -273,9 +280,9 @@ def _sole_in_torso(hips, sole, *, R_level_trunk, turn, aside, geometry):
 
 def _head_and_arms(left_foot_ahead):
     """Hold the head still and swing each arm against the foot of its side."""
-    swing = _ARM_SWING * left_foot_ahead
-    left = [_SHOULDER_PITCH - swing, _SHOULDER_YAW, -_ARM_ROLL, -_ELBOW]
-    right = [_SHOULDER_PITCH + swing, -_SHOULDER_YAW, _ARM_ROLL, _ELBOW]
+    swing = ARM_SWING * left_foot_ahead
+    left = [SHOULDER_PITCH - swing, SHOULDER_YAW, -ARM_ROLL, -ELBOW]
+    right = [SHOULDER_PITCH + swing, -SHOULDER_YAW, ARM_ROLL, ELBOW]
     return jnp.stack([jnp.asarray(angle, left_foot_ahead.dtype) for angle in [0.0, 0.0, *left, *right]])
 
 

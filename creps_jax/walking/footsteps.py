@@ -9,18 +9,18 @@ from creps_jax.robots.robot import NAO, Robot
 from creps_jax.typing import Array, Bool, Float, Scalar
 from creps_jax.walking.params import WalkParams
 
-__all__ = ["FOOT_SPACING", "Footstep", "Stance", "next_footstep", "standing"]
+__all__ = ["FOOT_SPACING", "Footstep", "Stance", "compose", "next_footstep", "relative_pose", "standing"]
 
 FOOT_SPACING = NAO.foot_spacing
 """Distance of the two feet of the simulated NAO when standing, m."""
 
 # Where the swing foot may land, seen from where it stands beside the support foot: forward, sideways on its
 # own side (reach and collision), turned; m and rad. The body stays within half of that box.
-_LANDING_LOW = (-0.20, -0.01, -0.6)
-_LANDING_HIGH = (0.20, 0.07, 0.6)
+LANDING_LOW = (-0.20, -0.01, -0.6)
+LANDING_HIGH = (0.20, 0.07, 0.6)
 # The swing foot aims at the pose of the body one and a half steps ahead: after one, the body is between
 # the feet.
-_SWING_AHEAD = 1.5
+SWING_AHEAD = 1.5
 
 
 class Stance(NamedTuple):
@@ -58,30 +58,34 @@ def standing(dtype=jnp.float32, *, robot: Robot = NAO) -> Stance:
     return Stance(origin, left, -left, jnp.asarray(True), origin)
 
 
-def _compose(pose, offset):
-    """Walk from a planar pose by an offset seen from it."""
+def compose(pose: Float[Array, "3"], offset: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Return the planar pose in the world that is `offset` (x, y, yaw) in the frame of `pose`, m and rad."""
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     return pose + jnp.stack([cos * offset[0] - sin * offset[1], sin * offset[0] + cos * offset[1], offset[2]])
 
 
-def _seen_from(pose, other):
-    """Return a planar pose as seen from another one."""
+def relative_pose(pose: Float[Array, "3"], other: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Return the planar pose `other` (x, y, yaw) in the frame of `pose`, m and rad."""
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
     x, y, yaw = other - pose
     return jnp.stack([cos * x + sin * y, cos * y - sin * x, yaw])
 
 
 def _towards(step, wanted, growth: Scalar, spacing: float):
-    """Move the step size towards the wanted one by no more than the growth."""
+    """Move the step size towards the wanted one, which it may grow to by no more than the growth.
+
+    It may shrink at once: how fast a walker slows down is limited by its command.
+    """
     limit = jnp.stack([growth, growth, growth / spacing])
-    return step + jnp.clip(wanted - step, -limit, limit)
+    shrunk = jnp.clip(step, jnp.minimum(wanted, 0.0), jnp.maximum(wanted, 0.0))
+    return shrunk + jnp.clip(wanted - shrunk, -limit, limit)
 
 
 def _limit(seen, swing_side, share, spacing):
     """Limit a pose, seen from the support foot, to a share of the box in which the swing foot may land."""
     low, high = (
         share * jnp.array([ahead, spacing + aside, turned], seen.dtype)
-        for ahead, aside, turned in (_LANDING_LOW, _LANDING_HIGH)
+        for ahead, aside, turned in (LANDING_LOW, LANDING_HIGH)
     )
     mirror = jnp.ones_like(seen).at[1].set(swing_side)
     return mirror * jnp.clip(mirror * seen, low, high)
@@ -93,7 +97,7 @@ def next_footstep(
 ) -> tuple[Footstep, Stance]:
     """Plan the next step.
 
-    The step size approaches the commanded one by `step_growth * step_duration` a step. The landing place
+    The step size grows towards the commanded one by `step_growth * step_duration` a step. The landing place
     is limited to what the leg reaches and to its own side of the support foot, and the body to half of
     that.
 
@@ -115,10 +119,10 @@ def next_footstep(
     swing_side = jnp.where(stance.supports_left, -1.0, 1.0).astype(step.dtype)
 
     sideways = jnp.zeros_like(step).at[1].set(0.5 * spacing * swing_side)
-    aim = _compose(_compose(stance.body, _SWING_AHEAD * step), sideways)
-    swing_end = _compose(support, _limit(_seen_from(support, aim), swing_side, 1.0, spacing))
-    ahead = _compose(stance.body, step)
-    body = _compose(support, _limit(_seen_from(support, ahead), swing_side, 0.5, spacing))
+    aim = compose(compose(stance.body, SWING_AHEAD * step), sideways)
+    swing_end = compose(support, _limit(relative_pose(support, aim), swing_side, 1.0, spacing))
+    ahead = compose(stance.body, step)
+    body = compose(support, _limit(relative_pose(support, ahead), swing_side, 0.5, spacing))
     after = Stance(
         body=body,
         left=jnp.where(stance.supports_left, stance.left, swing_end),

@@ -13,10 +13,13 @@ __all__ = [
     "GRAVITY",
     "NAO_BOUNDS",
     "NAO_H25_BOUNDS",
+    "NAO_STEERED_BOUNDS",
     "PAPER_BOUNDS",
     "PARAM_LABELS",
     "PARAM_NAMES",
     "PARAM_UNITS",
+    "STEERED_PARAM_NAMES",
+    "STEERED_PARAM_UNITS",
     "WalkParams",
     "count_steps",
     "params_from_theta",
@@ -82,16 +85,28 @@ NAO_H25_BOUNDS = (
 )
 """Bounds in which the real NAO, whose legs are shorter and weaker, can walk."""
 
+STEERED_PARAM_NAMES = (*PARAM_NAMES, "step_side", "step_turn")
+"""Names of the parameters of a steered walk: the ten, and a step's displacement to the left and turn."""
+
+STEERED_PARAM_UNITS = (*PARAM_UNITS, "m", "rad")
+"""Their units in theta."""
+
+NAO_STEERED_BOUNDS = (
+    (0.0, 0.15, 0.02, 0.14, -5.0, 0.0, 0.0, -0.12, 0.0, 0.02, -0.08, -0.5),
+    (0.01, 0.20, 0.06, 0.40, 5.0, 1.0, 1.0, 0.15, 0.1, 0.2, 0.08, 0.5),
+)
+"""Bounds of a NAO's steered walk: `NAO_BOUNDS`, with steps backward, sideways and turning."""
+
 _SHORTEST_STEP = 0.08
 # What the engine accepts, whatever theta says. Within it every plan is finite.
-_SAFE_LOW = (0.0, 0.10, 0.0, _SHORTEST_STEP, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
-_SAFE_HIGH = (1.0, 0.22, 0.15, 4.0, 30.0, 2.0, 2.0, 0.2, 4.0, 10.0)
+SAFE_LOW = (0.0, 0.10, 0.0, _SHORTEST_STEP, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
+SAFE_HIGH = (1.0, 0.22, 0.15, 4.0, 30.0, 2.0, 2.0, 0.2, 4.0, 10.0)
 # Amplitude at which the spring's acceleration would reach that of gravity is A = g T^2 / (4 pi^2): there
 # the ZMP equation is singular. Share of it that is allowed.
-_MAX_AMPLITUDE_SHARE = 0.6
-_MAX_AMPLITUDE = 0.05
+MAX_AMPLITUDE_SHARE = 0.6
+MAX_AMPLITUDE = 0.05
 # Share of a step that double support may fill; the swing foot needs the rest.
-_MAX_DOUBLE_SUPPORT_SHARE = 0.6
+MAX_DOUBLE_SUPPORT_SHARE = 0.6
 
 
 class WalkParams(NamedTuple):
@@ -141,14 +156,14 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
     Raises:
         ValueError: If theta has not one entry for each parameter.
     """
-    safe = jnp.clip(theta, jnp.asarray(_SAFE_LOW, theta.dtype), jnp.asarray(_SAFE_HIGH, theta.dtype))
+    safe = jnp.clip(theta, jnp.asarray(SAFE_LOW, theta.dtype), jnp.asarray(SAFE_HIGH, theta.dtype))
     params = WalkParams(*safe)
     duration = params.step_duration
-    highest = jnp.minimum(_MAX_AMPLITUDE_SHARE * GRAVITY * duration**2 / (4.0 * math.pi**2), _MAX_AMPLITUDE)
+    highest = jnp.minimum(MAX_AMPLITUDE_SHARE * GRAVITY * duration**2 / (4.0 * math.pi**2), MAX_AMPLITUDE)
     return params._replace(
         amplitude=jnp.minimum(params.amplitude, highest),
         lean=params.lean * (math.pi / 180.0),
-        double_support=jnp.minimum(params.double_support, _MAX_DOUBLE_SUPPORT_SHARE * duration),
+        double_support=jnp.minimum(params.double_support, MAX_DOUBLE_SUPPORT_SHARE * duration),
     )
 
 

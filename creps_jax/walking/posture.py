@@ -10,7 +10,7 @@ from creps_jax.typing import Array, Float, Scalar, ScalarLike
 __all__ = ["Balance", "corrected_lean"]
 
 # A robot that leans further than this has fallen; the correction stays finite.
-_MAX_MEASURED = 0.8
+MAX_MEASURED = 0.8
 
 
 class Balance(NamedTuple):
@@ -49,6 +49,6 @@ def corrected_lean(
 
     Source: Abdolmaleki et al. 2016, Section 2.1, Robot Posture Controller; Glaser and Dorer 2013.
     """
-    measured = jnp.clip(measured, -_MAX_MEASURED, _MAX_MEASURED)
+    measured = jnp.clip(measured, -MAX_MEASURED, MAX_MEASURED)
     gains = jnp.stack([roll_gain, tilt_gain])
     return measured + gains * (intended - measured)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from creps_jax import checks
 from creps_jax.typing import Array, Float, Scalar
 
-__all__ = ["zmp_reference"]
+__all__ = ["zmp_reference", "zmp_shares"]
 
 
 @checks.arguments
@@ -32,8 +32,20 @@ def zmp_reference(
 
     Source: Abdolmaleki et al. 2016, Section 2.2.
     """
+    return zmp_shares(phase, double_support_share) @ jnp.stack([start, support, end])
+
+
+def zmp_shares(phase: Float[Array, " n"], double_support_share: Scalar) -> Float[Array, "n 3"]:
+    """Return the shares of start, support foot and end in the ZMP reference; see `zmp_reference`.
+
+    Args:
+        phase: Time over the duration of the step, t/T.
+        double_support_share: Part of the step that is double support, 0 to 1.
+
+    Returns:
+        The shares, which sum to one in each row.
+    """
     half = jnp.maximum(0.5 * double_support_share, 1e-6)
     away_from_start = jnp.clip(phase / half, 0.0, 1.0)
     towards_end = jnp.clip((phase - (1.0 - half)) / half, 0.0, 1.0)
-    shares = jnp.stack([1.0 - away_from_start, away_from_start - towards_end, towards_end], axis=1)
-    return shares @ jnp.stack([start, support, end])
+    return jnp.stack([1.0 - away_from_start, away_from_start - towards_end, towards_end], axis=1)

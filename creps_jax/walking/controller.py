@@ -1,0 +1,337 @@
+"""Steer a walk at run time, one control period at a time, by a command that may change at any time.
+
+A `Walker` plans step by step. Each step is planned in the frame of the body at its start, so that the numbers
+stay small however far the robot walks.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from creps_jax import checks
+from creps_jax.numerics.rotations import wrapped
+from creps_jax.robots.robot import NAO, Robot
+from creps_jax.typing import Array, Bool, Float, IntScalar, Scalar, ScalarLike
+from creps_jax.walking.com import com_trajectory, com_velocities, continuous_com_trajectory
+from creps_jax.walking.engine import (
+    NUM_NODES,
+    BodyPose,
+    StepPlan,
+    body_pose,
+    com_heights,
+    pose_joints,
+    stand_upright,
+)
+from creps_jax.walking.footsteps import Footstep, Stance, compose, next_footstep, relative_pose, standing
+from creps_jax.walking.params import WalkParams
+from creps_jax.walking.posture import Balance
+from creps_jax.walking.set_points import next_set_point
+from creps_jax.walking.zmp import zmp_shares
+
+__all__ = ["Gait", "Stage", "Walker", "WalkerState"]
+
+COM_METHODS = ("continuous", "one_step")
+# Largest shift of the ZMP in the feet that keeps the velocity of the CoM continuous, m (forward, sideways).
+LARGEST_SHIFT = (0.04, 0.02)
+# Distance (m) and angle (rad) up to which feet count as side by side.
+SIDE_BY_SIDE = 1e-3
+# Largest heading error that is carried from one step to the next, rad.
+MAX_HEADING_ERROR = 1.0
+
+
+class Gait(NamedTuple):
+    """How to walk at a command.
+
+    Attributes:
+        params: Walking parameters; `step_length` is not used, see `step`.
+        step: Displacement of the body in one step (x forward, y left, yaw), m and rad.
+    """
+
+    params: WalkParams
+    step: Float[Array, "3"]
+
+
+class Stage(enum.IntEnum):
+    """What a walker is doing."""
+
+    STANDING = 0
+    """Both feet stand side by side, the body is at rest."""
+    STARTING = 1
+    """Both feet stand, the body gains the velocity of the first step."""
+    WALKING = 2
+    """One foot swings."""
+    STOPPING = 3
+    """Both feet stand side by side, the body comes to rest."""
+
+
+class WalkerState(NamedTuple):
+    """The state of a walk between two control periods; a pytree of arrays.
+
+    Attributes:
+        stage: What the walker is doing, see `Stage`.
+        time: Time since the start of the present step, s.
+        origin: Planar pose (x, y, yaw) of the body at the start of the present step in the world, as planned,
+            m and rad; the yaw is from -pi to pi.
+        command: Present command (vx, vy, turn rate), limited by the acceleration, m/s and rad/s.
+        gait: Gait of the present step.
+        plan: Plan of the present step, in the frame of `origin`.
+        after: Stance after the present step, in the same frame.
+        com_velocity: Velocity of the CoM at the end of the present step, in the same frame, m/s.
+        set_point: Last set-points of the joints, rad.
+    """
+
+    stage: IntScalar
+    time: Scalar
+    origin: Float[Array, "3"]
+    command: Float[Array, "3"]
+    gait: Gait
+    plan: StepPlan
+    after: Stance
+    com_velocity: Float[Array, "2"]
+    set_point: Float[Array, "22"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Walker:
+    """A walk that follows commands: settings, and two pure functions that can be jitted and vmapped.
+
+    A command is (vx forward, vy left, turn rate) in the frame of the body, m/s and rad/s. At the command zero
+    the robot stops and stands with its feet side by side.
+
+    Attributes:
+        gait: (command (3,)) -> `Gait`, read at the start of each step.
+        robot: The robot.
+        period: Time between two set-points, s.
+        balance: How steps answer to the measured orientation.
+        acceleration: Largest rate of change of the command along its three axes, m/s^2, m/s^2, rad/s^2.
+        com: How the CoM is planned: "continuous" continues its velocity from step to step, and begins and
+            ends a walk with a step on both feet; "one_step" solves each step for itself between two
+            positions, as in the paper.
+
+    Raises:
+        ValueError: If a setting is out of its range.
+
+    Source: Abdolmaleki et al. 2016, Section 2; `continuous_com_trajectory` for the continuous CoM.
+    """
+
+    gait: Callable[[Float[Array, "3"]], Gait]
+    robot: Robot = NAO
+    period: float = 0.02
+    balance: Balance = Balance()
+    acceleration: tuple[float, float, float] = (0.4, 0.4, 2.0)
+    com: str = "continuous"
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        checks.function("gait", self.gait, "(command) -> Gait")
+        checks.instance("robot", self.robot, Robot)
+        checks.instance("balance", self.balance, Balance)
+        checks.number("period", self.period, above=0.0)
+        if (
+            len(checks.finite("acceleration", checks.vector("acceleration", self.acceleration), above=0.0))
+            != 3
+        ):
+            raise ValueError(f"acceleration must be three numbers above 0, got {self.acceleration}")
+        if self.com not in COM_METHODS:
+            raise ValueError(f"com must be one of {', '.join(COM_METHODS)}, got {self.com!r}")
+
+    def start(self, slope: ScalarLike = 0.0) -> WalkerState:
+        """Return the state of a robot that stands at the origin and looks along x.
+
+        Args:
+            slope: Angle by which the floor rises along x of the world, rad.
+        """
+        gait = self.gait(jnp.zeros(3))
+        zero = jnp.zeros(3, gait.step.dtype)
+        stance = standing(zero.dtype, robot=self.robot)
+        state = WalkerState(
+            stage=jnp.int32(Stage.STANDING),
+            time=zero[0],
+            origin=zero,
+            command=zero,
+            gait=gait,
+            plan=_in_place(stance),
+            after=stance,
+            com_velocity=zero[:2],
+            set_point=jnp.zeros(len(self.robot.joint_lower), zero.dtype),
+        )
+        upright = zero.at[1].set(gait.params.lean + slope)
+        return state._replace(set_point=self._joints(state, upright, slope))
+
+    @checks.arguments
+    def step(
+        self,
+        state: WalkerState,
+        command: Float[Array, "3"],
+        measured_rpy: Float[Array, "3"],
+        slope: ScalarLike = 0.0,
+    ) -> tuple[WalkerState, Float[Array, "22"]]:
+        """Walk on by one control period.
+
+        Args:
+            state: The state.
+            command: Wanted speeds of the body (vx forward, vy left, turn rate), m/s and rad/s.
+            measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw may be of any turn.
+            slope: Angle by which the floor rises along x of the world, rad.
+
+        Returns:
+            The new state, and the set-points of the joints at the end of the period, in the order of
+            `nao_geometry.JOINT_NAMES`, rad.
+
+        Raises:
+            ValueError: If an array has another shape, or the command or orientation is not finite.
+        """
+        checks.finite("command", command)
+        limit = self.period * jnp.asarray(self.acceleration, command.dtype)
+        command = state.command + jnp.clip(command - state.command, -limit, limit)
+        time, is_over = self._advanced_time(state, command)
+        begun = self._begin_step(state, command, measured_rpy[2])
+        state = jax.tree.map(lambda new, old: jnp.where(is_over, new, old), begun, state)
+        state = state._replace(time=time, command=command)
+        target = self._joints(state, measured_rpy, slope)
+        set_point = next_set_point(state.set_point, target, self.period, robot=self.robot)
+        return state._replace(set_point=set_point), set_point
+
+    def pose(self, state: WalkerState, slope: ScalarLike = 0.0) -> BodyPose:
+        """Return the planned pose of hips and feet in the world, m and rad."""
+        pose = self._pose_in_step(state, slope)
+
+        def in_world(place: Float[Array, "4"]) -> Float[Array, "4"]:
+            x, y, height, yaw = place
+            x, y, yaw = compose(state.origin, jnp.stack([x, y, yaw]))
+            return jnp.stack([x, y, height, yaw])
+
+        return BodyPose(in_world(pose.hips), in_world(pose.left), in_world(pose.right), pose.turn)
+
+    def _pose_in_step(self, state: WalkerState, slope: ScalarLike) -> BodyPose:
+        """Return the planned pose of hips and feet in the frame of `state.origin`, m and rad."""
+        params = state.gait.params
+        is_stepping = state.stage == Stage.WALKING
+        params = params._replace(swing_height=jnp.where(is_stepping, params.swing_height, 0.0))
+        pose = body_pose(params, state.plan, state.time / params.step_duration, robot=self.robot)
+        pose = pose._replace(turn=jnp.where(is_stepping, pose.turn, 0.0))
+        return stand_upright(pose, jnp.asarray(slope, pose.hips.dtype))
+
+    def _advanced_time(self, state: WalkerState, command: Array) -> tuple[Scalar, Bool[Array, ""]]:
+        """Return the time within the step one period later, and whether another step begins."""
+        is_standing = state.stage == Stage.STANDING
+        time, duration = state.time + self.period, state.gait.params.step_duration
+        is_over = jnp.where(is_standing, jnp.any(command != 0.0), time >= duration)
+        after = jnp.where(is_standing, self.period, time - duration)
+        waiting = jnp.where(is_standing, 0.0, time)
+        return jnp.where(is_over, after, waiting), is_over
+
+    def _joints(self, state: WalkerState, measured_rpy: Array, slope: ScalarLike) -> Float[Array, "22"]:
+        """Return the joint targets of a state, for the measured orientation of the trunk."""
+        yaw = wrapped(measured_rpy[2] - state.origin[2])
+        params, pose = state.gait.params, self._pose_in_step(state, slope)
+        params = params._replace(lean=params.lean + slope)
+        return pose_joints(params, pose, measured_rpy.at[2].set(yaw), balance=self.balance, robot=self.robot)
+
+    def _begin_step(self, state: WalkerState, command: Array, measured_yaw: Scalar) -> WalkerState:
+        """Plan the next step, in the frame of the body at its start."""
+        body = state.after.body
+        before = Stance(
+            jnp.zeros_like(body),
+            relative_pose(body, state.after.left),
+            relative_pose(body, state.after.right),
+            state.after.supports_left,
+            state.after.step,
+        )
+        gait = self.gait(command)
+        wants = jnp.any(command != 0.0)
+        rests = ~wants & self._is_side_by_side(before)
+        stage = self._next_stage(state.stage, wants, rests)
+        wanted = jnp.where(wants, gait.step, 0.0)
+        footstep, stepped = next_footstep(gait.params, before, wanted, robot=self.robot)
+        still = _in_place(before)
+        is_stepping = stage == Stage.WALKING
+        footstep, after = jax.tree.map(
+            lambda new, old: jnp.where(is_stepping, new, old), (footstep, stepped), (still.footstep, before)
+        )
+        com, com_velocity = self._plan_com(state, gait.params, wanted, before, footstep, after, stage)
+        yaw = compose(state.origin, body)[2]
+        error = jnp.clip(wrapped(yaw - measured_yaw), -MAX_HEADING_ERROR, MAX_HEADING_ERROR)
+        return state._replace(
+            stage=stage,
+            origin=compose(state.origin, body).at[2].set(wrapped(measured_yaw + error)),
+            gait=gait,
+            plan=StepPlan(footstep, com, jnp.stack([before.body[2], after.body[2]])),
+            after=after,
+            com_velocity=com_velocity,
+        )
+
+    def _next_stage(self, stage: IntScalar, wants: Bool[Array, ""], rests: Bool[Array, ""]) -> IntScalar:
+        is_one_step = self.com == "one_step"
+        first = Stage.WALKING if is_one_step else Stage.STARTING
+        last = Stage.STANDING if is_one_step else Stage.STOPPING
+        on_both_feet = (stage == Stage.STANDING) | (stage == Stage.STOPPING)
+        return jnp.where(
+            on_both_feet,
+            jnp.where(wants, first, Stage.STANDING),
+            jnp.where((stage == Stage.WALKING) & rests, last, Stage.WALKING),
+        ).astype(jnp.int32)
+
+    def _plan_com(
+        self,
+        state: WalkerState,
+        params: WalkParams,
+        wanted: Float[Array, "3"],
+        before: Stance,
+        footstep: Footstep,
+        after: Stance,
+        stage: IntScalar,
+    ) -> tuple[Float[Array, "n 2"], Float[Array, "2"]]:
+        """Return the CoM of a step at its nodes, and its velocity at the end, in the frame of `before`."""
+        heights = com_heights(params, robot=self.robot)
+        duration = params.step_duration
+        share = params.double_support / duration
+        shares = zmp_shares(jnp.linspace(0.0, 1.0, NUM_NODES, dtype=share.dtype), share)
+        middle = jnp.where(stage == Stage.WALKING, footstep.support[:2], before.body[:2])
+        zmp = shares @ jnp.stack([before.body[:2], middle, after.body[:2]])
+        velocities = jax.vmap(com_velocities, in_axes=(1, 1, None, None, None))
+        solve = jax.vmap(com_trajectory, in_axes=(1, None, None, 0, 0, None), out_axes=1)
+        # Along x and, by Eq. 2 in place of Eq. 1, along y.
+        if self.com == "one_step":
+            com = solve(zmp, *heights, before.body[:2], after.body[:2], duration)  # Eq. 2
+            return com, velocities(com, zmp, *heights, duration)[:, 1]
+        # The step ends with the velocity with which the one-step solution of the step after it begins.
+        following, then = next_footstep(params, after, wanted, robot=self.robot)
+        next_zmp = shares @ jnp.stack([after.body[:2], following.support[:2], then.body[:2]])
+        next_com = solve(next_zmp, *heights, after.body[:2], then.body[:2], duration)
+        next_velocity = velocities(next_com, next_zmp, *heights, duration)[:, 0]
+        is_last = (stage == Stage.WALKING) & ~jnp.any(wanted != 0.0) & self._is_side_by_side(after)
+        is_last = is_last | (stage == Stage.STOPPING) | (stage == Stage.STANDING)
+        end_velocity = jnp.where(is_last, 0.0, next_velocity)
+        start = _continued(state)
+        end = jnp.stack([after.body[:2], end_velocity], axis=1)
+        plan = jax.vmap(continuous_com_trajectory, in_axes=(1, None, None, None, 0, 0, None, 0), out_axes=1)
+        largest = jnp.asarray(LARGEST_SHIFT, share.dtype)
+        com, shifted = plan(zmp, shares[:, 1], *heights, start, end, duration, largest)
+        return com, velocities(com, shifted, *heights, duration)[:, 1]
+
+    def _is_side_by_side(self, stance: Stance) -> Bool[Array, ""]:
+        spacing = jnp.zeros_like(stance.left).at[1].set(-self.robot.foot_spacing)
+        apart = relative_pose(stance.left, stance.right) - spacing
+        return jnp.all(jnp.abs(apart) < SIDE_BY_SIDE)
+
+
+def _continued(state: WalkerState) -> Float[Array, "2 2"]:
+    """Return position (m) and velocity (m/s) of the CoM at the end of a step, seen from the body there."""
+    body = state.after.body
+    position = relative_pose(body, jnp.append(state.plan.com[-1], body[2]))
+    velocity = relative_pose(body.at[:2].set(0.0), jnp.append(state.com_velocity, body[2]))
+    return jnp.stack([position[:2], velocity[:2]], axis=1)
+
+
+def _in_place(stance: Stance) -> StepPlan:
+    """Plan a step on both feet: neither they nor the body move."""
+    support = jnp.where(stance.supports_left, stance.left, stance.right)
+    other = jnp.where(stance.supports_left, stance.right, stance.left)
+    footstep = Footstep(support, other, other, stance.supports_left)
+    com = jnp.tile(stance.body[:2], (NUM_NODES, 1))
+    return StepPlan(footstep, com, jnp.stack([stance.body[2], stance.body[2]]))

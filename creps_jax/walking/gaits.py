@@ -1,0 +1,114 @@
+"""From theta, or from a learned policy, to the gait that a walker reads at each command."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+
+from creps_jax import checks
+from creps_jax.policies.learned import Learned
+from creps_jax.robots.robot import NAO, NAO_H25
+from creps_jax.typing import Array, Float
+from creps_jax.walking.controller import Gait, Walker
+from creps_jax.walking.params import PARAM_NAMES, params_from_theta
+from creps_jax.walking.posture import Balance
+
+__all__ = [
+    "COMMAND_NAMES",
+    "COMMAND_UNITS",
+    "learned_walker",
+    "limited_command",
+    "steered_gait",
+    "straight_gait",
+]
+
+COMMAND_NAMES = ("vx", "vy", "turn")
+"""Names of the axes of a command."""
+COMMAND_UNITS = ("m/s", "m/s", "rad/s")
+"""Their units."""
+# What steps sideways (m) and turns (rad) are limited to, whatever theta says.
+LARGEST_SIDE, LARGEST_TURN = 0.2, 1.0
+_ROBOTS = {robot.name: robot for robot in (NAO, NAO_H25)}
+
+
+@checks.arguments
+def straight_gait(theta: Float[Array, "10"]) -> Gait:
+    """Return the gait of the ten parameters, straight ahead."""
+    params = params_from_theta(theta)
+    zero = jnp.zeros_like(params.step_length)
+    return Gait(params, jnp.stack([params.step_length, zero, zero]))
+
+
+@checks.arguments
+def steered_gait(theta: Float[Array, "12"]) -> Gait:
+    """Return the gait of the ten parameters and a step's displacement to the left (m) and turn (rad)."""
+    params = params_from_theta(theta[: len(PARAM_NAMES)])
+    side = jnp.clip(theta[len(PARAM_NAMES)], -LARGEST_SIDE, LARGEST_SIDE)
+    turn = jnp.clip(theta[len(PARAM_NAMES) + 1], -LARGEST_TURN, LARGEST_TURN)
+    return Gait(params, jnp.stack([params.step_length, side, turn]))
+
+
+def limited_command(
+    command: Float[Array, "3"], low: Float[Array, "3"], high: Float[Array, "3"]
+) -> Float[Array, "3"]:
+    """Move a command towards the middle of a box of commands, into the ellipsoid inside the box."""
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    offset = (command - middle) / half
+    length = jnp.sqrt(jnp.maximum(jnp.sum(offset**2), 1e-12))
+    return middle + half * offset / jnp.maximum(length, 1.0)
+
+
+def learned_walker(learned: Learned, **settings: Any) -> Walker:
+    """Make the walker of a learned walk.
+
+    A policy for (vx, vy, turn) is asked for each command, limited to the ellipsoid inside its ranges. A
+    policy for a speed alone is asked for the size of the forward speed; its step is scaled where the speed is
+    out of its range, and steps to the side and turns are those of the command.
+
+    Args:
+        learned: A policy of `nao_walk` or `nao_steered_walk`. Conditions, such as a slope, are taken as zero.
+        settings: Settings of `Walker`, such as `period`; the others are those of learning.
+
+    Raises:
+        ValueError: If the policy is of another task, or a setting is out of its range.
+    """
+    checks.instance("learned", learned, Learned)
+    names, task = learned.contexts.names, learned.task
+    if names[:1] != ("speed",) and names != COMMAND_NAMES:
+        expected = f"speed, or {', '.join(COMMAND_NAMES)}"
+        raise ValueError(f"learned must be a walk whose contexts are {expected}, got {', '.join(names)}")
+    robot = task.get("robot", NAO.name)
+    if robot not in _ROBOTS:
+        raise ValueError(f"the robot of learned must be one of {', '.join(_ROBOTS)}, got {robot!r}")
+    gait = _command_gait(learned) if names == COMMAND_NAMES else _speed_gait(learned)
+    defaults = {
+        "robot": _ROBOTS[robot],
+        "balance": Balance(**task.get("balance", {})),
+        "com": task.get("com", "one_step"),
+    }
+    if "acceleration" in task:
+        defaults["acceleration"] = tuple(task["acceleration"])
+    return Walker(gait, **(defaults | settings))
+
+
+def _command_gait(learned: Learned) -> Callable[[Array], Gait]:
+    low, high = learned.contexts.low, learned.contexts.high
+
+    def gait(command: Float[Array, "3"]) -> Gait:
+        ends = (jnp.asarray(end, command.dtype) for end in (low, high))
+        return steered_gait(learned.thetas(limited_command(command, *ends)[None])[0])
+
+    return gait
+
+
+def _speed_gait(learned: Learned) -> Callable[[Array], Gait]:
+    low, high = learned.contexts.low[0], learned.contexts.high[0]
+
+    def gait(command: Float[Array, "3"]) -> Gait:
+        speed = jnp.clip(jnp.abs(command[0]), low, high)
+        context = jnp.zeros(learned.contexts.size, command.dtype).at[0].set(speed)
+        params = params_from_theta(learned.thetas(context[None])[0])
+        ahead = params.step_length * jnp.clip(command[0] / speed, -1.0, 1.0)
+        return Gait(params, jnp.stack([ahead, *(params.step_duration * command[1:])]))
+
+    return gait
