@@ -29,6 +29,9 @@ EXPERIMENTS = {
         "the same up and down slopes: the context is speed and slope; starts from the shipped walk",
         ("quick", "best"),
     ),
+    "steer": Entry(
+        "learn to walk at any command: forward, backward, sideways and turning, from scratch", ("quick",)
+    ),
     "fig05_sinus": Entry(
         "learn the sine of the context, with linear and with RBF features (Fig. 5)", ("paper", "quick")
     ),
