@@ -1,4 +1,4 @@
-"""The command line `creps-jax play | export | session`, also `python -m creps_jax.tools`.
+"""The command line `creps-jax play | drive | export | session`, also `python -m creps_jax.tools`.
 
 jax and MuJoCo are imported only when a command needs them: help and mistakes are printed at once.
 """
@@ -21,7 +21,8 @@ Use a learned policy.
 
   creps-jax play --speed 0.3        show the parameters and a video of a walk at this speed
   creps-jax play                    show a video of walks at six speeds
-  creps-jax export --to walk.h      write a policy (.onnx, .h) or one of its walks (.csv, .npz)
+  creps-jax drive                   steer a walk with the arrow keys (or --script commands.csv)
+  creps-jax export --to walk.c      write a policy (.onnx, .h), the whole walk (.c) or set-points (.csv, .npz)
   creps-jax session                 learn on a real robot, trial by trial
 
 Without --policy, play and export load the latest learned policy, or else the policy of the package; play
@@ -60,12 +61,14 @@ class Export:
     """Write a policy, or the joint set-points of one of its walks, for other programs.
 
     Attributes:
-        to: The file. A policy is written as an ONNX model (.onnx) or a C header (.h); a walk from standstill,
-            without posture feedback, is written as a table (.csv) or arrays (.npz).
+        to: The file. A policy is written as an ONNX model (.onnx) or a C header (.h). The whole walk, with
+            planner, kinematics and posture feedback, is written as C code (.c, and its header .h). A walk
+            from standstill, without posture feedback, is written as a table (.csv) or arrays (.npz).
         policy: Policy file; by default the latest learned walking policy, or else the shipped one.
         robot: Robot of the policy; by default the robot of the file, or nao.
         speed: Speed of the walk in m/s (.csv and .npz only).
         duration: Length of the walk in s (.csv and .npz only); 8 by default.
+        period: Time between two set-points in s (.c, .csv and .npz only); 0.02 by default.
     """
 
     to: Annotated[Path, arg(metavar="FILE")]
@@ -73,10 +76,30 @@ class Export:
     robot: _Text = None
     speed: _Number = None
     duration: _Seconds = None
+    period: _Seconds = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Drive:
+    """Drive a simulated robot: with the arrow keys in a window, or by a file of commands into a video.
+
+    Attributes:
+        script: CSV file of commands, with the columns time, vx, vy, turn (s, m/s, m/s, rad/s); by default a
+            window opens, and the arrow keys change the command.
+        policy: Policy file; by default the shipped policy that can be steered.
+        video: The .mp4 file that a script makes.
+        seed: Seed of the noise of a script; 0 by default.
+    """
+
+    script: _File = None
+    policy: _File = None
+    video: Path = Path("results/drive.mp4")
+    seed: int = 0
 
 
 Command = (
     Annotated[Play, subcommand("play")]
+    | Annotated[Drive, subcommand("drive")]
     | Annotated[Export, subcommand("export")]
     | Annotated[SessionCommand, subcommand("session")]
 )
@@ -90,7 +113,7 @@ def main(arguments: Sequence[str]) -> int:
     return answer(lambda: _run(parse(Command, arguments, prog="creps-jax")))
 
 
-def _run(command: Play | Export | SessionCommand) -> int:
+def _run(command: Play | Drive | Export | SessionCommand) -> int:
     return _HANDLERS[type(command)](command)
 
 
@@ -103,6 +126,21 @@ def _play(command: Play) -> int:
     return 0
 
 
+def _drive(command: Drive) -> int:
+    check_seed(command.seed)
+    import_mjx_quietly()
+    from creps_jax.tools import drive
+
+    policy = command.policy or drive.default_policy()
+    if command.script is None:
+        from creps_jax.tools.drive_live import drive_live
+
+        drive_live(policy, say=say)
+    else:
+        drive.drive_by_script(command.script, policy, command.video, seed=command.seed, say=say)
+    return 0
+
+
 def _export(command: Export) -> int:
     from creps_jax.tools.export import export
 
@@ -112,6 +150,7 @@ def _export(command: Export) -> int:
         robot=command.robot,
         speed=command.speed,
         duration=command.duration,
+        period=command.period,
         say=say,
     )
     return 0
@@ -122,4 +161,4 @@ def _session(command: SessionCommand) -> int:
     return 0
 
 
-_HANDLERS = {Play: _play, Export: _export, SessionCommand: _session}
+_HANDLERS = {Play: _play, Drive: _drive, Export: _export, SessionCommand: _session}

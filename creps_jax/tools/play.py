@@ -21,7 +21,7 @@ from creps_jax.tasks.walking import record_walk
 from creps_jax.tools import results
 from creps_jax.tools.robots import find_robot
 from creps_jax.tools.video import Clip, VideoError, write_video
-from creps_jax.walking.params import PARAM_NAMES
+from creps_jax.walking.params import PARAM_NAMES, STEERED_PARAM_NAMES
 from creps_jax.walking.posture import Balance
 
 POLICY = "policy.npz"
@@ -69,7 +69,7 @@ def show(
             say(f"  {name.replace('_', ' '):16}{value:8.4f} {unit}".rstrip())
     clips = record(policy, speeds, seed=seed)
     for clip in clips:
-        say(clip.caption)
+        say(str(clip.caption))
     save_film(clips, out, say, robot=robot_of(policy))
 
 
@@ -158,27 +158,28 @@ def shipped_policy(robot: str | None = None) -> Path:
         UserError: if there is none, or the robot is unknown.
     """
     robot = find_robot(robot or NAO.name).robot.name
-    shipped = sorted(policies_folder(robot).glob("*.npz"))
-    if not shipped:
+    shipped = policies_folder(robot) / "walk.npz"
+    if not shipped.exists():
         asked = "" if robot == NAO.name else f" --robot {robot}"
         raise UserError(
             f"no policy has been learned yet: python -m experiments run walk{asked} --preset quick"
         )
-    return shipped[-1]
+    return shipped
 
 
-def load_walking_policy(path: Path, robot: str | None = None) -> Learned:
+def load_walking_policy(path: Path, robot: str | None = None, *, can_steer: bool = False) -> Learned:
     """Load a policy file and check that it is a walking policy.
 
     Args:
         path: the file.
         robot: name of the robot that the policy must have; None accepts any.
+        can_steer: whether a policy of a steered walk is accepted as well.
 
     Raises:
         UserError: if it is another policy, unreadable, or of an unknown robot.
     """
     policy = load(path)
-    if policy.parameters.names != PARAM_NAMES:
+    if policy.parameters.names not in (PARAM_NAMES, STEERED_PARAM_NAMES)[: 1 + can_steer]:
         found = ", ".join(policy.parameters.names)
         raise UserError(f"{path} is no walking policy: its parameters are {found}")
     try:

@@ -29,13 +29,13 @@ class Clip(NamedTuple):
     """A recorded walk and its caption.
 
     Attributes:
-        caption: one line of text.
+        caption: one line of text, or one for each position.
         qpos: (n, nq) generalised positions.
         period: seconds between two of them.
         slope: slope of the floor, deg, positive if it rises ahead; positions are in the frame of the floor.
     """
 
-    caption: str
+    caption: str | Sequence[str]
     qpos: np.ndarray
     period: float
     slope: float = 0.0
@@ -88,7 +88,8 @@ def write_video(path: Path, model: Path, clips: Sequence[Clip], *, still_at: flo
 
 def _job(model: Path, clips: Sequence[Clip], still_at: float) -> dict[str, object]:
     arrays: dict[str, object] = {"model": str(model.resolve()), "still_at": still_at}
-    arrays["captions"] = np.array([clip.caption for clip in clips])
+    for index, clip in enumerate(clips):
+        arrays[f"caption{index}"] = np.array(clip.caption)
     arrays["periods"] = np.array([clip.period for clip in clips])
     arrays["slopes"] = np.array([clip.slope for clip in clips])
     return arrays | {f"qpos{index}": np.asarray(clip.qpos) for index, clip in enumerate(clips)}
@@ -109,15 +110,14 @@ def _render_job(job: Path, video: Path, still: Path) -> None:
     from PIL import Image
 
     arrays = load_arrays(job)
-    captions = arrays["captions"].tolist()
     clips = [
         Clip(
-            caption,
+            arrays[f"caption{index}"].tolist(),
             arrays[f"qpos{index}"].astype(float),
-            float(arrays["periods"][index]),
-            float(arrays["slopes"][index]),
+            float(period),
+            float(slope),
         )
-        for index, caption in enumerate(captions)
+        for index, (period, slope) in enumerate(zip(arrays["periods"], arrays["slopes"], strict=True))
     ]
     columns, rows = layout(len(clips))
     model = mujoco.MjModel.from_xml_path(str(arrays["model"]))
@@ -178,9 +178,13 @@ def _frames(
                 image = Image.fromarray(renderer.render()).reduce(factor)
                 row, column = divmod(cell, columns)
                 frame[row * height : (row + 1) * height, column * width : (column + 1) * width] = _captioned(
-                    image, clip.caption, index * clip.period, scale
+                    image, _caption_at(clip, index), index * clip.period, scale
                 )
             yield frame
+
+
+def _caption_at(clip: Clip, index: int) -> str:
+    return clip.caption if isinstance(clip.caption, str) else clip.caption[index]
 
 
 def _tilt(data, slope: float) -> np.ndarray:

@@ -129,7 +129,7 @@ def test_help_and_mistakes_are_answered_without_starting_jax(tmp_path, arguments
         ([], 0, "creps-jax play --speed", ""),
         (["play", "--help"], 0, "Policy file", ""),
         (["play", "--seed", "-1"], 2, "", "error: seed must be from 0"),
-        (["export", "--to", "x.onx"], 2, "", "error: --to must end in .onnx, .h, .csv, .npz, got x.onx"),
+        (["export", "--to", "x.onx"], 2, "", "error: --to must end in .onnx, .h, .c, .csv, .npz, got x.onx"),
         (["export", "--to", "x"], 2, "", "error: --to must end in"),
         (["export", "--to", "x.csv"], 2, "", "error: x.csv would hold the joint set-points of a walk"),
         (["export", "--to", "x.h", "--speed", "0.3"], 2, "", "error: --speed goes with .csv and .npz: x.h"),

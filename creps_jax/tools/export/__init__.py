@@ -11,8 +11,10 @@ if TYPE_CHECKING:
     from creps_jax.policies.learned import Learned
 
 _OF_POLICY = {".onnx": "ONNX model", ".h": "C header"}
+_WHOLE_WALK = {".c": "C code of the walk"}
 _OF_WALK = {".csv": "CSV table", ".npz": "NumPy arrays"}
 _DURATION = 8.0
+_PERIOD = 0.02
 
 
 def export(
@@ -22,9 +24,10 @@ def export(
     robot: str | None = None,
     speed: float | None,
     duration: float | None,
+    period: float | None = None,
     say: Callable[[str], None],
 ) -> None:
-    """Write a policy as .onnx or .h (C), or the joint set-points of one of its walks as .csv or .npz.
+    """Write a policy as .onnx or .h (C), the whole walk as .c, or the set-points of a walk as .csv or .npz.
 
     Args:
         to: the file; its ending decides on the format. An existing file is overwritten.
@@ -32,22 +35,37 @@ def export(
         robot: name of the robot; None is the robot of the file, or without a file the NAO.
         speed: speed of the walk, m/s; required for a walk, and only for a walk.
         duration: length of the walk, s; only for a walk, 8 by default.
+        period: time between two set-points, s; only for a walk, 0.02 by default.
         say: prints one line.
 
     Raises:
         UserError: for a mistake in the request, an unreadable policy, or a file that cannot be written.
     """
     ending = to.suffix.lower()
-    _check_request(to, ending, speed, duration)
+    _check_request(to, ending, {"speed": speed, "duration": duration, "period": period})
     # The other imports take seconds: mistakes are reported before.
     path = policy or _default_policy(robot)
     if _are_the_same(to, path):
         raise UserError(f"--to {to} is the policy file itself, name another file")
-    if speed is not None:
+    period = _PERIOD if period is None else period
+    if ending in _WHOLE_WALK:
+        import_mjx_quietly()
+        from creps_jax.tools.export import walk_c
+        from creps_jax.tools.play import load_walking_policy
+
+        walk_c.save(to, load_walking_policy(path, robot, can_steer=True), period=period)
+    elif speed is not None:
         import_mjx_quietly()
         from creps_jax.tools.export import trajectory
 
-        walk = trajectory.plan(path, speed, _DURATION if duration is None else duration, robot=robot)
+        seconds = _DURATION if duration is None else duration
+        walk = trajectory.plan(path, speed, seconds, robot=robot, period=period)
+        falls_at = trajectory.time_of_fall(path, speed, seconds, robot=robot)
+        if falls_at is not None:
+            say(
+                f"note: a simulated robot that plays this walk without feedback falls at {falls_at:.1f} s; "
+                "a .c file has the feedback"
+            )
         {".csv": trajectory.save_csv, ".npz": trajectory.save_npz}[ending](to, walk)
     else:
         from creps_jax.policies.learned import load
@@ -56,22 +74,21 @@ def export(
         saved = load(path) if robot is None else _load_walking_policy(path, robot)
         {".onnx": onnx_model.save, ".h": c_header.save}[ending](to, saved)
     say(f"policy: {path}")
-    say(f"{(_OF_POLICY | _OF_WALK)[ending]}: {to}")
+    say(f"{(_OF_POLICY | _OF_WALK | _WHOLE_WALK)[ending]}: {to}")
 
 
-def _check_request(to: Path, ending: str, speed: float | None, duration: float | None) -> None:
+def _check_request(to: Path, ending: str, options: dict[str, float | None]) -> None:
     """Refuse an unknown ending, and options that it does not have."""
-    if ending in _OF_WALK:
-        if speed is None:
-            raise UserError(f"{to} would hold the joint set-points of a walk, which need --speed, in m/s")
-    elif ending in _OF_POLICY:
-        for name, value in (("speed", speed), ("duration", duration)):
-            if value is not None:
-                raise UserError(
-                    f"--{name} goes with {' and '.join(_OF_WALK)}: {to} is the policy, for every context"
-                )
-    else:
-        raise UserError(f"--to must end in {', '.join(_OF_POLICY | _OF_WALK)}, got {to}")
+    endings = _OF_POLICY | _WHOLE_WALK | _OF_WALK
+    if ending not in endings:
+        raise UserError(f"--to must end in {', '.join(endings)}, got {to}")
+    if ending in _OF_WALK and options["speed"] is None:
+        raise UserError(f"{to} would hold the joint set-points of a walk, which need --speed, in m/s")
+    for name, value in options.items():
+        allowed = (*_OF_WALK, *_WHOLE_WALK) if name == "period" else tuple(_OF_WALK)
+        if value is not None and ending not in allowed:
+            what = "the walk at every command" if ending in _WHOLE_WALK else "the policy, for every context"
+            raise UserError(f"--{name} goes with {' and '.join(allowed)}: {to} is {what}")
 
 
 def _are_the_same(path: Path, other: Path) -> bool:

@@ -63,33 +63,34 @@ def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
         _enum(f"{prefix}_parameter", policy.parameters.names),
         _strings(f"{prefix}_context_names[{contexts}]", policy.contexts.names),
         _strings(f"{prefix}_context_units[{contexts}]", policy.contexts.units),
-        _floats(f"{prefix}_context_low[{contexts}]", formula.context_low),
-        _floats(f"{prefix}_context_high[{contexts}]", formula.context_high),
+        floats(f"{prefix}_context_low[{contexts}]", formula.context_low),
+        floats(f"{prefix}_context_high[{contexts}]", formula.context_high),
         _strings(f"{prefix}_parameter_names[{params}]", policy.parameters.names),
         _strings(f"{prefix}_parameter_units[{params}]", policy.parameters.units),
-        _floats(f"{prefix}_parameter_low[{params}]", formula.param_low),
-        _floats(f"{prefix}_parameter_high[{params}]", formula.param_high),
-        _floats(f"{prefix}_coef[{features}][{params}]", formula.coef),
+        floats(f"{prefix}_parameter_low[{params}]", formula.param_low),
+        floats(f"{prefix}_parameter_high[{params}]", formula.param_high),
+        floats(f"{prefix}_coef[{features}][{params}]", formula.coef),
     ]
     if len(formula.centers):
-        tables.append(_floats(f"{prefix}_centers[{features}][{contexts}]", formula.centers))
-        tables.append(_floats(f"{prefix}_widths[{contexts}]", formula.widths))
+        tables.append(floats(f"{prefix}_centers[{features}][{contexts}]", formula.centers))
+        tables.append(floats(f"{prefix}_widths[{contexts}]", formula.widths))
     return "\n".join(tables)
 
 
 def _prefix(name: str) -> str:
     """Return a name as the prefix of C identifiers."""
-    name = _identifier(name).lower()
+    name = identifier(name).lower()
     return f"task_{name}" if name[:1].isdigit() else name or "learned"
 
 
-def _identifier(name: str) -> str:
+def identifier(name: str) -> str:
+    """Return a name with underscores in place of what C does not allow in one."""
     return re.sub("[^0-9A-Za-z]+", "_", name).strip("_")
 
 
 def _enumerators(tag: str, names: Sequence[str]) -> list[str]:
     """Make C identifiers of names; if two are equal, all get their index."""
-    stems = [f"{tag}_{_identifier(name)}".upper() for name in names]
+    stems = [f"{tag}_{identifier(name)}".upper() for name in names]
     return stems if len(set(stems)) == len(stems) else [f"{stem}_{i}" for i, stem in enumerate(stems)]
 
 
@@ -101,9 +102,9 @@ def _strings(declarator: str, values: Iterable[str]) -> str:
     return f"static const char *const {declarator} = {{{_lines(map(_string, values))}}};\n"
 
 
-def _floats(declarator: str, values: np.ndarray) -> str:
+def floats(declarator: str, values: np.ndarray) -> str:
     """Declare a vector, or a matrix with a brace for each row."""
-    rows = [", ".join(map(_number, row)) for row in np.atleast_2d(values)]
+    rows = [", ".join(map(number, row)) for row in np.atleast_2d(values)]
     rows = [f"{{{row}}}" for row in rows] if values.ndim == 2 else rows
     indent = " " * (values.ndim - 1)
     wrapped = [textwrap.fill(row, 96, subsequent_indent=indent, break_on_hyphens=False) for row in rows]
@@ -120,7 +121,7 @@ def _string(text: str) -> str:
     return '"' + "".join(chr(b) if chr(b) in _PLAIN else f"\\{b:03o}" for b in text.encode()) + '"'
 
 
-def _number(value: np.floating) -> str:
+def number(value: np.floating) -> str:
     """Return a float literal that reads back as the same number."""
     if np.isinf(value):
         return "INFINITY" if value > 0 else "-INFINITY"

@@ -31,8 +31,8 @@ class Formula(NamedTuple):
     param_high: np.ndarray
 
 
-def formula_of(learned: Learned) -> Formula:
-    """Return the numbers of a policy.
+def formula_of(learned: Learned, kinds: tuple[str, ...] = ("linear", "rbf")) -> Formula:
+    """Return the numbers of a policy, whose features must be of one of these kinds.
 
     Raises:
         UserError: if its features cannot be exported, or a number is too large for single precision.
@@ -44,8 +44,8 @@ def formula_of(learned: Learned) -> Formula:
         centers, widths = rbf_grid(
             features["low"], features["high"], features["num_centers"], bandwidth=features["width"]
         )
-    elif features["kind"] != "linear":
-        raise UserError(f"features must be linear or rbf to be exported, got {features['kind']}")
+    elif features["kind"] not in kinds:
+        raise UserError(f"features must be {' or '.join(kinds)} to be exported, got {features['kind']}")
     if not np.isfinite([learned.contexts.low, learned.contexts.high]).all():
         raise UserError(f"contexts must have a range to be exported, got {learned.contexts}")
     numbers = Formula(

@@ -7,18 +7,23 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from creps_jax.errors import UserError
 from creps_jax.files import save_arrays, save_text
 from creps_jax.robots.nao_geometry import JOINT_NAMES
-from creps_jax.tasks.walking import CONTROL_PERIOD
+from creps_jax.robots.robot import Robot
+from creps_jax.simulation import c
+from creps_jax.tasks.closed_loop import CONTROL_PERIOD, WalkNoise, is_robot_fallen, make_setup, stand
 from creps_jax.tools import tables
 from creps_jax.tools.play import load_walking_policy, robot_of
+from creps_jax.walking.gaits import learned_walker
 from creps_jax.walking.params import params_from_theta
 from creps_jax.walking.set_points import open_loop_set_points
 
 # Time and position grow during the walk, and lose digits in single precision.
 _LONGEST = 600.0
+_SHORTEST_PERIOD, _LONGEST_PERIOD = 0.001, 0.1
 
 
 class Trajectory(NamedTuple):
@@ -28,14 +33,18 @@ class Trajectory(NamedTuple):
         speed: asked speed, m/s.
         time: (n,) time, s.
         set_point: (n, 22) angles in the order of `nao_geometry.JOINT_NAMES`, with its signs and zeros, rad.
+        robot: the robot.
     """
 
     speed: float
     time: np.ndarray
     set_point: np.ndarray
+    robot: Robot
 
 
-def plan(path: Path, speed: float, duration: float, *, robot: str | None = None) -> Trajectory:
+def plan(
+    path: Path, speed: float, duration: float, *, robot: str | None = None, period: float = CONTROL_PERIOD
+) -> Trajectory:
     """Plan a walk at a speed, by the walking engine without simulation.
 
     The trunk has its intended lean at all times, without noise. There is no posture feedback, which needs the
@@ -47,6 +56,7 @@ def plan(path: Path, speed: float, duration: float, *, robot: str | None = None)
         speed: asked speed, m/s.
         duration: length of the walk, s.
         robot: name of the robot that the policy must have; None accepts any.
+        period: time between two set-points, s.
 
     Raises:
         UserError: if it is not a walking policy, or of another robot, or if speed or duration are out of
@@ -55,23 +65,60 @@ def plan(path: Path, speed: float, duration: float, *, robot: str | None = None)
     policy = load_walking_policy(path, robot)
     if policy.task.get("name") != "walk":
         raise UserError(f"{path} is no walking policy: its task is {policy.task.get('name')!r}")
-    if not CONTROL_PERIOD <= duration <= _LONGEST:
-        raise UserError(f"--duration must be {CONTROL_PERIOD} to {_LONGEST:g} s, got {duration}")
-    theta = policy.theta(speed)
-    walk = partial(open_loop_set_points, duration=duration, period=CONTROL_PERIOD, robot=robot_of(policy))
+    if not _SHORTEST_PERIOD <= period <= _LONGEST_PERIOD:
+        raise UserError(f"--period must be {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s, got {period}")
+    if not period <= duration <= _LONGEST:
+        raise UserError(f"--duration must be {period} to {_LONGEST:g} s, got {duration}")
+    theta, body = policy.theta(speed), robot_of(policy)
+    walk = partial(open_loop_set_points, duration=duration, period=period, robot=body)
     set_point = np.asarray(jax.jit(lambda theta: walk(params_from_theta(theta)))(jnp.asarray(theta)))
-    return Trajectory(speed, np.arange(len(set_point)) * CONTROL_PERIOD, set_point)
+    return Trajectory(speed, np.arange(len(set_point)) * period, set_point, body)
+
+
+def time_of_fall(path: Path, speed: float, duration: float, *, robot: str | None = None) -> float | None:
+    """Play a walk on a simulated robot without noise and feedback; return when it falls, s, None if never.
+
+    Args:
+        path: policy file.
+        speed: asked speed, m/s.
+        duration: length of the walk, s.
+        robot: name of the robot that the policy must have; None accepts any.
+    """
+    walk = plan(path, speed, max(duration, 2 * CONTROL_PERIOD), robot=robot)
+    body = robot_of(load_walking_policy(path, robot))
+    setup = make_setup(body, None, duration, WalkNoise(0.0, 0.0, 0.0), (), c.make_control_step)
+
+    def step(carry, pair):
+        state, has_fallen = carry
+        before, after = pair
+        state = setup.control_step(state, before, after, (after - before) / CONTROL_PERIOD)
+        has_fallen = has_fallen | is_robot_fallen(setup, state)
+        return (state, has_fallen), has_fallen
+
+    def play(set_point):
+        walker = learned_walker(load_walking_policy(path, robot))
+        start = stand(setup, walker, walker.start())
+        return lax.scan(step, (start, jnp.asarray(False)), (set_point[:-1], set_point[1:]))[1]
+
+    has_fallen = np.asarray(jax.jit(play)(jnp.asarray(walk.set_point)))
+    return float((1 + has_fallen.argmax()) * CONTROL_PERIOD) if has_fallen.any() else None
 
 
 def save_csv(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory as CSV: a header with units, then time and joints, a row for each control step."""
-    columns: dict[str, list[object]] = {"time (s)": [f"{time:.2f}" for time in trajectory.time]}
-    for name, angles in zip(JOINT_NAMES, trajectory.set_point.T, strict=True):
+    """Write a trajectory as CSV: a header with units, then time and joints, a row for each control step.
+
+    Names and signs of the joints are those of the robot's own software.
+    """
+    columns: dict[str, list[object]] = {"time (s)": [f"{time:.9g}" for time in trajectory.time]}
+    robot = trajectory.robot
+    signs = np.asarray(robot.own_signs, np.float32)
+    for name, angles in zip(robot.own_names, (trajectory.set_point * signs).T, strict=True):
         # The shortest decimals that read back as the same single-precision number.
         columns[f"{name} (rad)"] = [str(angle) for angle in angles]
     save_text(path, tables.to_csv(columns))
 
 
 def save_npz(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory as .npz: speed (m/s), time (s), set_point (rad) and joint_names."""
-    save_arrays(path, {**trajectory._asdict(), "joint_names": np.array(JOINT_NAMES)})
+    """Write a trajectory as .npz: speed (m/s), time (s), set_point (rad), joint_names of the simulation."""
+    arrays = {name: values for name, values in trajectory._asdict().items() if name != "robot"}
+    save_arrays(path, {**arrays, "joint_names": np.array(JOINT_NAMES)})

@@ -1,0 +1,183 @@
+"""The exported C code walks as Python does: the same set-points, and a simulated robot in closed loop."""
+
+import ctypes
+import dataclasses
+import shutil
+import subprocess
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from jax import lax
+
+from creps_jax.errors import UserError
+from creps_jax.files import policies_folder
+from creps_jax.policies.learned import load
+from creps_jax.robots.nao_geometry import JOINT_NAMES
+from creps_jax.robots.robot import NAO, NAO_H25
+from creps_jax.tools.export import walk_c
+from creps_jax.walking.gaits import learned_walker
+
+COMPILER = shutil.which("cc")
+STRICT = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror"]
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
+WALKS = {
+    "straight": ("nao", "walk", "one_step"),
+    "straight, continuous": ("nao", "walk", "continuous"),
+    "steered": ("nao", "steer", "continuous"),
+    "real NAO": ("nao_h25", "walk", "one_step"),
+}
+
+
+def policy_of(robot, name, com):
+    policy = load(policies_folder(robot) / f"{name}.npz")
+    return dataclasses.replace(policy, task={**policy.task, "com": com})
+
+
+class CWalk:
+    """The compiled code of a walk."""
+
+    def __init__(self, folder, policy, period=0.02):
+        walk_c.save(folder / "walk.c", policy, period=period)
+        self.robot = learned_walker(policy).robot
+        library = folder / "walk.so"
+        command = [COMPILER, *STRICT, "-O2", "-shared", "-fPIC", folder / "walk.c", "-o", library, "-lm"]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        functions = ctypes.CDLL(str(library))
+        self._step = getattr(functions, f"{self.robot.name}_walk_step")
+        self._step.argtypes = [ctypes.c_void_p, ctypes.c_void_p, *[ctypes.c_float] * 3, ctypes.c_void_p]
+        self._state = ctypes.create_string_buffer(8192)
+        self.out = np.zeros(len(JOINT_NAMES), np.float32)
+        getattr(functions, f"{self.robot.name}_walk_start")(
+            self._state, ctypes.c_void_p(self.out.ctypes.data)
+        )
+
+    def step(self, command, rpy):
+        command = np.asarray(command, np.float32)
+        self._step(self._state, command.ctypes.data, *map(float, rpy), self.out.ctypes.data)
+        return self.set_point()
+
+    def set_point(self):
+        return self.out * np.array(self.robot.own_signs, np.float32)
+
+
+def changing_commands(num, seed=0):
+    rng = np.random.default_rng(seed)
+    commands = np.repeat(rng.uniform([-0.2, -0.1, -0.5], [0.4, 0.1, 0.5], (-(-num // 75), 3)), 75, axis=0)[
+        :num
+    ]
+    commands[num // 3 : num // 2] = 0.0
+    return commands.astype(np.float32)
+
+
+@needs_compiler
+@pytest.mark.parametrize("period", [0.02, 0.012])
+@pytest.mark.parametrize("walk", WALKS)
+def test_set_points_are_those_of_python(walk, period, tmp_path):
+    if period != 0.02 and walk != "steered":
+        pytest.skip("one walk is enough for another period")
+    policy = policy_of(*WALKS[walk])
+    num = round(20.0 / period)
+    commands = changing_commands(num)
+    rpy = 0.1 * np.cumsum(np.random.default_rng(1).normal(0.0, 0.01, (num, 3)), axis=0)
+    rpy[:, 2] = np.linspace(0.0, 9.0, num)  # more than one turn
+    walker = learned_walker(policy, period=period)
+
+    def step(state, now):
+        state, set_point = walker.step(state, *now)
+        return state, set_point
+
+    given = jnp.asarray(commands), jnp.asarray(rpy, jnp.float32)
+    wanted = np.asarray(jax.jit(lambda given: lax.scan(step, walker.start(), given)[1])(given))
+    code = CWalk(tmp_path, policy, period)
+    np.testing.assert_allclose(code.set_point(), walker.start().set_point, atol=1e-5)
+    found = np.array([code.step(*now) for now in zip(commands, rpy, strict=True)])
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
+
+
+@needs_compiler
+def test_a_simulated_robot_walks_by_the_c_code_in_closed_loop(tmp_path):
+    policy = policy_of(*WALKS["steered"])
+    code = CWalk(tmp_path, policy)
+    simulation = Simulation(code.robot, code.set_point())
+    commands = changing_commands(1000, seed=3)
+    for command in commands:
+        simulation.step(code.step(command, simulation.rpy()))
+    assert simulation.height() > 0.25
+    speed = simulation.path()[:300]
+    assert np.isfinite(speed).all()
+
+
+class Simulation:
+    """A robot in plain MuJoCo, with the servos of its model."""
+
+    def __init__(self, robot, set_point):
+        from creps_jax.simulation.models import load_nao
+
+        self.model = load_nao(robot)
+        self.data = mujoco.MjData(self.model)
+        self.data.qpos[2] = robot.geometry.torso_height
+        self.data.qpos[7:] = set_point
+        mujoco.mj_forward(self.model, self.data)
+        # Down until the lowest point of the feet is on the floor.
+        lowest = min(
+            self.data.geom_xpos[geom, 2] - self.model.geom_size[geom, 0]
+            for geom in range(self.model.ngeom)
+            if self.model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE
+        )
+        self.data.qpos[2] -= lowest
+        self.last = set_point
+        self.positions = []
+
+    def rpy(self):
+        w, x, y, z = self.data.qpos[3:7]
+        roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+        return roll, pitch, np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+    def step(self, set_point):
+        substeps = round(0.02 / self.model.opt.timestep)
+        for index in range(substeps):
+            self.data.ctrl[:] = self.last + (index + 1) / substeps * (set_point - self.last)
+            mujoco.mj_step(self.model, self.data)
+        self.last = set_point
+        self.positions.append(self.data.qpos[:3].copy())
+
+    def height(self):
+        return self.data.qpos[2]
+
+    def path(self):
+        return np.array(self.positions)
+
+
+@needs_compiler
+def test_the_headers_of_two_robots_can_be_included_together(tmp_path):
+    for robot in ("nao", "nao_h25"):
+        folder = tmp_path / robot
+        folder.mkdir()
+        walk_c.save(folder / "walk.c", policy_of(robot, "walk", "one_step"))
+        (folder / "walk.h").rename(tmp_path / f"{robot}.h")
+    (tmp_path / "both.c").write_text(
+        '#include "nao.h"\n#include "nao_h25.h"\n'
+        "int main(void) { return sizeof(nao_walk_state) == sizeof(nao_h25_walk_state) ? 0 : 1; }\n"
+    )
+    done = subprocess.run([COMPILER, *STRICT, "-c", "both.c"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_real_nao_has_the_names_and_signs_of_its_own_software(tmp_path):
+    code, header = walk_c.make_walk(policy_of("nao_h25", "walk", "one_step"))
+    assert '"LKneePitch"' in code and '"left_knee"' not in code and "nao_h25_walk_step" in header
+    knee = NAO_H25.own_names.index("LKneePitch")
+    # It bends with positive angles.
+    assert NAO_H25.own_signs[knee] * NAO_H25.joint_lower[knee] > 1.0
+    assert NAO.own_names == JOINT_NAMES and set(NAO.own_signs) == {1.0}
+
+
+@pytest.mark.parametrize("period", [0.0, 1.0, float("nan")])
+def test_a_bad_period_is_refused(period):
+    with pytest.raises(UserError, match="--period must be"):
+        walk_c.make_walk(policy_of("nao", "walk", "one_step"), period=period)
