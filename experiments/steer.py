@@ -41,6 +41,7 @@ from experiments.walking.settings import PHYSICS, TIMESTEP
 LOW = (-0.2, -0.15, -0.8)
 HIGH = (0.6, 0.15, 0.8)
 """The box of commands; commands are drawn and evaluated in the ellipsoid inside it."""
+_MIDDLE, _HALF = np.add(LOW, HIGH) * 0.5, np.subtract(HIGH, LOW) * 0.5
 PARAMETERS = Space(STEERED_PARAM_NAMES, *NAO_STEERED_BOUNDS, STEERED_PARAM_UNITS, SIGMOID)
 """The parameters of a steered walk, and their bounds."""
 START_UP = 1.5
@@ -220,19 +221,11 @@ def command_grid() -> np.ndarray:
     """Return the commands (n, 3) of the evaluation: a grid of the box, of which what is in the ellipsoid."""
     axes = [np.linspace(low, high, num) for low, high, num in zip(LOW, HIGH, (5, 3, 5), strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    offset = (grid - _middle()) / _half()
+    offset = (grid - _MIDDLE) / _HALF
     inside = grid[np.sum(offset**2, axis=1) <= 1.0 + 1e-6]
     # The ends of the axes, and between them.
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3.0)
-    return np.concatenate([inside, _middle() + _half() * corners]).astype(np.float32)
-
-
-def _middle() -> np.ndarray:
-    return 0.5 * (np.array(LOW) + np.array(HIGH))
-
-
-def _half() -> np.ndarray:
-    return 0.5 * (np.array(HIGH) - np.array(LOW))
+    return np.concatenate([inside, _MIDDLE + _HALF * corners]).astype(np.float32)
 
 
 def random_commands(seed: int, num: int, seconds: float) -> np.ndarray:
@@ -246,7 +239,7 @@ def random_commands(seed: int, num: int, seconds: float) -> np.ndarray:
             direction = rng.normal(size=3)
             offset = rng.random() ** (1 / 3) * direction / np.linalg.norm(direction)
             end = begin + round(rng.uniform(1.0, 2.0) / CONTROL_PERIOD)
-            drive[begin:end] = _middle() + _half() * offset
+            drive[begin:end] = _MIDDLE + _HALF * offset
             begin = end
     return commands
 

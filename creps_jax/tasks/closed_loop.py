@@ -31,8 +31,6 @@ __all__ = ["CONTROL_PERIOD", "WalkNoise"]
 
 CONTROL_PERIOD = 0.02
 """Duration of a control step, s."""
-AT_ONCE = (1e6, 1e6, 1e6)
-"""Acceleration of a command that is followed at once."""
 # A robot has fallen if its torso is below this share of its height with straight legs (with the knees bent
 # as far as possible it has 0.8 of it), or if the trunk leans by more than 50 degrees.
 _FALLEN_SHARE = 0.2 / 0.385

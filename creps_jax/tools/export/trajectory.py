@@ -85,8 +85,8 @@ def time_of_fall(path: Path, speed: float, duration: float, *, robot: str | None
         robot: name of the robot that the policy must have; None accepts any.
     """
     walk = plan(path, speed, max(duration, 2 * CONTROL_PERIOD), robot=robot)
-    body = robot_of(load_walking_policy(path, robot))
-    setup = make_setup(body, None, duration, WalkNoise(0.0, 0.0, 0.0), (), c.make_control_step)
+    walker = learned_walker(load_walking_policy(path, robot))
+    setup = make_setup(walk.robot, None, duration, WalkNoise(0.0, 0.0, 0.0), (), c.make_control_step)
 
     def step(carry, pair):
         state, has_fallen = carry
@@ -96,7 +96,6 @@ def time_of_fall(path: Path, speed: float, duration: float, *, robot: str | None
         return (state, has_fallen), has_fallen
 
     def play(set_point):
-        walker = learned_walker(load_walking_policy(path, robot))
         start = stand(setup, walker, walker.start())
         return lax.scan(step, (start, jnp.asarray(False)), (set_point[:-1], set_point[1:]))[1]
 
