@@ -225,6 +225,15 @@ def advance(
     return WalkState(robot, walking)
 
 
+def without_fallen(state: WalkState, has_fallen: Bool[Array, ""]) -> WalkState:
+    """Return the state with NaN for a robot that has fallen: C MuJoCo skips it.
+
+    A batch continues until all its robots have finished.
+    """
+    robot = jax.tree.map(lambda x: jnp.where(has_fallen, jnp.nan, x), state.robot)
+    return state._replace(robot=robot)
+
+
 def is_fallen(setup: WalkSetup, walk: Walk, state: WalkState) -> Bool[Array, ""]:
     """Return whether the torso is low or far from upright; a state that is not finite counts as fallen."""
     circumstances = walk.circumstances

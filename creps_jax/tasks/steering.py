@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -29,6 +28,7 @@ from creps_jax.tasks.closed_loop import (
     check_numbers,
     is_fallen,
     make_setup,
+    without_fallen,
 )
 from creps_jax.tasks.conditions import Condition
 from creps_jax.typing import Array, Bool, Float, Int, IntScalar, PRNGKey, Scalar, VectorLike
@@ -245,15 +245,12 @@ def _walk_to_end(
         return (progress.tick < setup.num_ticks) & ~progress.has_fallen
 
     def step(progress: _Progress) -> _Progress:
-        # A batch continues until all its robots have finished. A state of NaN makes C MuJoCo skip a robot
-        # that has fallen.
-        robot = jax.tree.map(lambda x: jnp.where(progress.has_fallen, jnp.nan, x), progress.state.robot)
         part = jnp.sum(progress.tick >= begins) - 1
-        before = progress.state._replace(robot=robot)
+        before = without_fallen(progress.state, progress.has_fallen)
         state = advance(setup, walker, walk, progress.tick, before, highest * factors[part])
         has_fallen = is_fallen(setup, walk, state)
         is_measured = (progress.tick >= measured_from[part]) & ~has_fallen
-        changes = moved(robot.qpos, state.robot.qpos), CONTROL_PERIOD * state.walker.command
+        changes = moved(before.robot.qpos, state.robot.qpos), CONTROL_PERIOD * state.walker.command
         travelled, commanded = (
             total.at[part].add(jnp.where(is_measured, change, 0.0))
             for total, change in zip((progress.travelled, progress.commanded), changes, strict=True)

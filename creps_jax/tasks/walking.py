@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -28,6 +27,7 @@ from creps_jax.tasks.closed_loop import (
     check_numbers,
     is_fallen,
     make_setup,
+    without_fallen,
 )
 from creps_jax.tasks.conditions import Condition
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar
@@ -266,10 +266,7 @@ def _walk_to_end(
         return (progress.tick < setup.num_ticks) & ~progress.has_fallen
 
     def step(progress: _Progress) -> _Progress:
-        # A batch continues until all its robots have finished. A state of NaN makes C MuJoCo skip a robot
-        # that has fallen.
-        robot = jax.tree.map(lambda x: jnp.where(progress.has_fallen, jnp.nan, x), progress.state.robot)
-        state = progress.state._replace(robot=robot)
+        state = without_fallen(progress.state, progress.has_fallen)
         state = advance(setup, walker, walk, progress.tick, state, _ahead(start.robot.qpos.dtype))
         tick = progress.tick + 1
         is_start_up = tick <= start_up_ticks
