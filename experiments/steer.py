@@ -78,6 +78,7 @@ class Settings:
         heading_gain: share of the heading error that a step turns back; a robot that is steered needs
             none, and falls less without.
         placement_gain: shift of the landing foot towards the side of the tilt, see `Balance`.
+        filter_time: time constant of the filter for the measured roll and pitch, s; 0 for no filter.
         acceleration: largest rate of change of the command, kept with the policy: forward and sideways,
             m/s^2, and turning, rad/s^2.
         learning_acceleration: the same in learning: faster changes are harder.
@@ -105,6 +106,7 @@ class Settings:
     duration: float = 8.0
     heading_gain: float = 0.0
     placement_gain: float = 0.6
+    filter_time: float = 0.06
     acceleration: tuple[float, float, float] = (0.6, 0.1, 0.5)
     learning_acceleration: tuple[float, float, float] = (0.6, 0.4, 2.0)
     com: str = "continuous"
@@ -115,7 +117,7 @@ class Settings:
 
     def balance(self) -> Balance:
         """Return the gains of the response to the measured orientation."""
-        return Balance(self.heading_gain, self.placement_gain)
+        return Balance(self.heading_gain, self.placement_gain, self.filter_time)
 
     def features(self) -> FeatureMap:
         """Return the features of the command: all products up to a degree."""

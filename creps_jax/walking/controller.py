@@ -28,7 +28,7 @@ from creps_jax.walking.engine import (
 )
 from creps_jax.walking.footsteps import Footstep, Stance, compose, next_footstep, relative_pose, standing
 from creps_jax.walking.params import WalkParams
-from creps_jax.walking.posture import Balance
+from creps_jax.walking.posture import Balance, Tilt, next_tilt
 from creps_jax.walking.set_points import next_set_point
 from creps_jax.walking.zmp import zmp_shares
 
@@ -81,6 +81,7 @@ class WalkerState(NamedTuple):
         plan: Plan of the present step, in the frame of `origin`.
         after: Stance after the present step, in the same frame.
         com_velocity: Velocity of the CoM at the end of the present step, in the same frame, m/s.
+        tilt: Roll and pitch of the trunk, filtered.
         set_point: Last set-points of the joints, rad.
     """
 
@@ -92,6 +93,7 @@ class WalkerState(NamedTuple):
     plan: StepPlan
     after: Stance
     com_velocity: Float[Array, "2"]
+    tilt: Tilt
     set_point: Float[Array, "22"]
 
 
@@ -131,6 +133,7 @@ class Walker:
         checks.instance("robot", self.robot, Robot)
         checks.instance("balance", self.balance, Balance)
         checks.number("period", self.period, above=0.0)
+        checks.number("balance.filter_time", self.balance.filter_time, least=0.0)
         if (
             len(checks.finite("acceleration", checks.vector("acceleration", self.acceleration), above=0.0))
             != 3
@@ -157,10 +160,10 @@ class Walker:
             plan=_in_place(stance),
             after=stance,
             com_velocity=zero[:2],
+            tilt=Tilt(zero[:2].at[1].set(gait.params.lean + slope), zero[:2]),
             set_point=jnp.zeros(len(self.robot.joint_lower), zero.dtype),
         )
-        upright = zero.at[1].set(gait.params.lean + slope)
-        return state._replace(set_point=self._joints(state, upright, slope))
+        return state._replace(set_point=self._joints(state, zero[0], slope))
 
     @checks.arguments
     def step(
@@ -191,8 +194,9 @@ class Walker:
         time, is_over = self._advanced_time(state, command)
         begun = self._begin_step(state, command, measured_rpy[2])
         state = jax.tree.map(lambda new, old: jnp.where(is_over, new, old), begun, state)
-        state = state._replace(time=time, command=command)
-        target = self._joints(state, measured_rpy, slope)
+        tilt = next_tilt(state.tilt, measured_rpy[:2], self.period, self.balance.filter_time)
+        state = state._replace(time=time, command=command, tilt=tilt)
+        target = self._joints(state, measured_rpy[2], slope)
         set_point = next_set_point(state.set_point, target, self.period, robot=self.robot)
         return state._replace(set_point=set_point), set_point
 
@@ -225,12 +229,12 @@ class Walker:
         waiting = jnp.where(is_standing, 0.0, time)
         return jnp.where(is_over, after, waiting), is_over
 
-    def _joints(self, state: WalkerState, measured_rpy: Array, slope: ScalarLike) -> Float[Array, "22"]:
-        """Return the joint targets of a state, for the measured orientation of the trunk."""
-        yaw = wrapped(measured_rpy[2] - state.origin[2])
+    def _joints(self, state: WalkerState, measured_yaw: Scalar, slope: ScalarLike) -> Float[Array, "22"]:
+        """Return the joint targets of a state, for its tilt and the measured yaw of the trunk."""
+        orientation = jnp.append(state.tilt.angle, wrapped(measured_yaw - state.origin[2]))
         params, pose = state.gait.params, self._pose_in_step(state, slope)
         params = params._replace(lean=params.lean + slope)
-        return pose_joints(params, pose, measured_rpy.at[2].set(yaw), balance=self.balance, robot=self.robot)
+        return pose_joints(params, pose, orientation, balance=self.balance, robot=self.robot)
 
     def _begin_step(self, state: WalkerState, command: Array, measured_yaw: Scalar) -> WalkerState:
         """Plan the next step, in the frame of the body at its start."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from creps_jax import checks
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["Balance", "corrected_lean"]
+__all__ = ["Balance", "Tilt", "corrected_lean", "filter_memory", "next_tilt"]
 
 # A robot that leans further than this has fallen; the correction stays finite.
 MAX_MEASURED = 0.8
@@ -19,13 +19,56 @@ class Balance(NamedTuple):
     Attributes:
         heading_gain: Share of the heading error that one step turns back.
         placement_gain: Share of the way by which a sideways tilt carries the hips out, that a landing foot is
-            put out to the same side. The tilt counts as it is measured at each time. The swing foot is put
+            put out to the same side. The tilt counts as it is at each time. The swing foot is put
             out by a part of the share that grows to all of it; the other foot keeps what is left of its own
             while the body is carried over.
+        filter_time: Time constant of the filter for the measured roll and pitch, s, see `next_tilt`; 0 for
+            no filter.
     """
 
     heading_gain: ScalarLike = 0.0
     placement_gain: ScalarLike = 0.0
+    filter_time: ScalarLike = 0.0
+
+
+class Tilt(NamedTuple):
+    """The roll and pitch of the trunk, estimated from noisy measurements.
+
+    Attributes:
+        angle: Roll and pitch, rad.
+        rate: Their rates of change, rad/s.
+    """
+
+    angle: Float[Array, "2"]
+    rate: Float[Array, "2"]
+
+
+def filter_memory(period: ScalarLike, filter_time: ScalarLike) -> Scalar:
+    """Return by which factor the weight of a measurement falls in one period."""
+    return jnp.exp(-period / jnp.maximum(jnp.asarray(filter_time, jnp.float32), 1e-6))
+
+
+def next_tilt(tilt: Tilt, measured: Float[Array, "2"], period: ScalarLike, filter_time: ScalarLike) -> Tilt:
+    """Update the estimate of the tilt with a measurement.
+
+    The filter is a line fitted to all measurements so far, whose weights fall exponentially with their age:
+    it has no lag while the tilt changes at a constant rate.
+
+    Args:
+        tilt: The estimate one period ago.
+        measured: Measured roll and pitch, rad.
+        period: Time between two measurements, s.
+        filter_time: Time in which a weight falls to 1/e, s; at 0 the angle is the measured one.
+
+    Returns:
+        The estimate at the time of the measurement.
+
+    Source: Morrison 1969, Introduction to sequential smoothing and prediction, the fading-memory polynomial
+    filter of degree 1.
+    """
+    memory = filter_memory(period, filter_time).astype(measured.dtype)
+    surprise = measured - (tilt.angle + period * tilt.rate)
+    return Tilt(measured - memory**2 * surprise, tilt.rate + (1.0 - memory) ** 2 / period * surprise)
 
 
 @checks.arguments

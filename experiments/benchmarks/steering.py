@@ -34,6 +34,7 @@ def main(policy: tyro.conf.Positional[Path | None] = None, drives: int = 50, see
         drives=drives,
         heading_gain=balance.heading_gain,
         placement_gain=balance.placement_gain,
+        filter_time=balance.filter_time,
         com=learned.task["com"],
         acceleration=tuple(learned.task["acceleration"]),
     )

@@ -99,6 +99,16 @@ def test_set_points_are_those_of_python(walk, period, tmp_path):
 
 
 @needs_compiler
+def test_a_missing_measurement_is_bridged(tmp_path):
+    policy = policy_of(*WALKS["steered"])
+    code = CWalk(tmp_path, policy)
+    missing = float("nan")
+    for tick in range(200):
+        rpy = (missing, missing, missing) if tick % 7 == 3 else (0.02, 0.05, 0.0)
+        assert np.isfinite(code.step((0.3, 0.0, 0.0), rpy)).all()
+
+
+@needs_compiler
 def test_a_simulated_robot_walks_by_the_c_code_in_closed_loop(tmp_path):
     policy = policy_of(*WALKS["steered"])
     code = CWalk(tmp_path, policy)

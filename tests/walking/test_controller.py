@@ -14,6 +14,7 @@ from creps_jax.walking.engine import com_heights, plan_walk, pose_at
 from creps_jax.walking.footsteps import relative_pose
 from creps_jax.walking.gaits import limited_command, straight_gait
 from creps_jax.walking.params import params_from_theta
+from creps_jax.walking.posture import Balance
 
 THETA = jnp.array([0.002, 0.17, 0.03, 0.24, 1.0, 0.4, 0.3, 0.05, 0.02, 0.12])
 UPRIGHT = jnp.zeros(3)
@@ -154,6 +155,10 @@ def test_commands_are_moved_into_the_ellipsoid():
     [
         ({"com": "two_step"}, "com must be one of continuous, one_step, got 'two_step'"),
         ({"period": 0.0}, "period must be finite and above 0, got 0.0"),
+        (
+            {"balance": Balance(filter_time=-0.1)},
+            "balance.filter_time must be finite and at least 0, got -0.1",
+        ),
         ({"acceleration": (1.0, 1.0, -1.0)}, "acceleration must be finite and above 0"),
     ],
 )

@@ -118,6 +118,7 @@ def _constants(policy: Learned, walker: Walker) -> list[str]:
         "SHARED_YAW_HIGH": min(robot.joint_upper[index] for index in yaws),
         "HEADING_GAIN": walker.balance.heading_gain,
         "PLACEMENT_GAIN": walker.balance.placement_gain,
+        "FILTER_MEMORY": posture.filter_memory(walker.period, walker.balance.filter_time),
         "MAX_HEADING_ERROR": controller.MAX_HEADING_ERROR,
         "SIDE_BY_SIDE": controller.SIDE_BY_SIDE,
         "MAX_HEADING_STEP": engine.MAX_HEADING_STEP,

@@ -708,6 +708,17 @@ static void pose_joints(const walk_state *state, const body_pose *pose, const fl
     }
 }
 
+/* Fit a line to all measurements of an angle, whose weights fall exponentially with their age. */
+static void filter_tilt(float *angle, float *rate, float measured)
+{
+    const float memory = FILTER_MEMORY, forgotten = 1.0f - memory;
+    const float predicted = *angle + WALK_PERIOD * *rate;
+    /* What is not finite counts as missing: the estimate goes on. */
+    const float surprise = isfinite(measured) ? measured - predicted : 0.0f;
+    *angle = predicted + (1.0f - memory * memory) * surprise;
+    *rate += forgotten * forgotten / WALK_PERIOD * surprise;
+}
+
 static void write_out(const walk_state *state, float out[WALK_NUM_JOINTS])
 {
     int i;
@@ -720,7 +731,7 @@ void walk_start(walk_state *state, float out[WALK_NUM_JOINTS])
 {
     walk_stance stance;
     body_pose pose;
-    float upright[3] = {0.0f, 0.0f, 0.0f}, step[3];
+    float upright[3], step[3];
     int i;
     for (i = 0; i < 3; ++i) {
         stance.body[i] = stance.left[i] = stance.right[i] = stance.step[i] = 0.0f;
@@ -734,7 +745,11 @@ void walk_start(walk_state *state, float out[WALK_NUM_JOINTS])
     state->com_velocity[0] = state->com_velocity[1] = 0.0f;
     read_gait(state->command, state->params, step);
     stand_in_place(state, &stance);
-    upright[1] = state->params[LEAN];
+    state->tilt[0] = state->tilt_rate[0] = state->tilt_rate[1] = 0.0f;
+    state->tilt[1] = state->params[LEAN];
+    upright[0] = state->tilt[0];
+    upright[1] = state->tilt[1];
+    upright[2] = 0.0f;
     pose_body(state, &pose);
     pose_joints(state, &pose, upright, state->set_point);
     write_out(state, out);
@@ -747,6 +762,9 @@ void walk_step(
     const int was_standing = state->stage == WALK_STANDING;
     body_pose pose;
     int is_over, i;
+    yaw = isfinite(yaw) ? yaw : state->origin[2];
+    filter_tilt(&state->tilt[0], &state->tilt_rate[0], roll);
+    filter_tilt(&state->tilt[1], &state->tilt_rate[1], pitch);
     for (i = 0; i < 3; ++i) {
         const float limit = WALK_PERIOD * ACCELERATION[i];
         /* What is not finite counts as zero: the robot stops. */
@@ -765,8 +783,8 @@ void walk_step(
         begin_step(state, limited, yaw);
     }
     copy3(state->command, limited);
-    measured[0] = roll;
-    measured[1] = pitch;
+    measured[0] = state->tilt[0];
+    measured[1] = state->tilt[1];
     measured[2] = wrapped(yaw - state->origin[2]);
     pose_body(state, &pose);
     pose_joints(state, &pose, measured, target);

@@ -46,6 +46,7 @@ typedef struct {
     float com[WALK_NUM_NODES][2];      /* centre of mass over the step, in the same frame, m */
     float com_velocity[2];             /* at the end of the step, m/s */
     float yaw[2];                      /* of the trunk at start and end of the step, rad */
+    float tilt[2], tilt_rate[2];       /* roll and pitch of the trunk, filtered, rad and rad/s */
     float set_point[WALK_NUM_JOINTS];  /* last set-points, in the order and signs of the simulation, rad */
 } walk_state;
 
