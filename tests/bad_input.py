@@ -345,6 +345,7 @@ PLAN = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), PLANS)
 PLANS = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), PLANS)
 POSE = engine.BodyPose(jnp.zeros(4), jnp.zeros(4), jnp.zeros(4), jnp.zeros(()))
 VECTOR = array(np.ones(3), bears=ANY)
+PLANAR = array(np.ones(2), bears=ANY)
 MATRIX = array(np.eye(3), bears=ANY)
 SCALAR = array(np.float32(0.5), bears=ANY)
 JOINTS = array(np.zeros(nao_geometry.NUM_JOINTS), bears=ANY)
@@ -469,6 +470,15 @@ MOTION = {
         period=number(0.02, above=0.0),
     ),
     "params_from_theta": traced(params.params_from_theta, theta=array(np.ones(10), bears=ANY)),
+    "plan_com": traced(engine.plan_com, params=record(WALK), start=PLANAR, support=PLANAR, end=PLANAR),
+    "plan_continuous_com": traced(
+        engine.plan_continuous_com,
+        params=record(WALK),
+        before=array(np.ones((2, 2)), bears=ANY),
+        start=PLANAR,
+        support=PLANAR,
+        end=array(np.ones((2, 2)), bears=ANY),
+    ),
     "plan_step": traced(
         engine.plan_step, params=record(WALK), stance=record(footsteps.standing()), command=VECTOR
     ),

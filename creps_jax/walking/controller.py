@@ -16,13 +16,14 @@ from creps_jax import checks
 from creps_jax.numerics.rotations import wrapped
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.typing import Array, Bool, Float, IntScalar, Scalar, ScalarLike
-from creps_jax.walking.com import com_trajectory, com_velocities, continuous_com_trajectory
 from creps_jax.walking.engine import (
     NUM_NODES,
     BodyPose,
+    ComPlan,
     StepPlan,
     body_pose,
-    com_heights,
+    plan_com,
+    plan_continuous_com,
     pose_joints,
     stand_upright,
 )
@@ -30,13 +31,10 @@ from creps_jax.walking.footsteps import Footstep, Stance, compose, next_footstep
 from creps_jax.walking.params import WalkParams
 from creps_jax.walking.posture import Balance, Tilt, next_tilt
 from creps_jax.walking.set_points import next_set_point
-from creps_jax.walking.zmp import zmp_shares
 
 __all__ = ["Gait", "Stage", "Walker", "WalkerState"]
 
 COM_METHODS = ("continuous", "one_step")
-# Largest shift of the ZMP in the feet that keeps the velocity of the CoM continuous, m (forward, sideways).
-LARGEST_SHIFT = (0.04, 0.02)
 # Distance (m) and angle (rad) up to which feet count as side by side.
 SIDE_BY_SIDE = 1e-3
 # Largest heading error that is carried from one step to the next, rad.
@@ -257,16 +255,16 @@ class Walker:
         footstep, after = jax.tree.map(
             lambda new, old: jnp.where(is_stepping, new, old), (footstep, stepped), (still.footstep, before)
         )
-        com, com_velocity = self._plan_com(state, gait.params, wanted, before, footstep, after, stage)
+        com = self._plan_com(state, gait.params, wanted, before, footstep, after, stage)
         yaw = compose(state.origin, body)[2]
         error = jnp.clip(wrapped(yaw - measured_yaw), -MAX_HEADING_ERROR, MAX_HEADING_ERROR)
         return state._replace(
             stage=stage,
             origin=compose(state.origin, body).at[2].set(wrapped(measured_yaw + error)),
             gait=gait,
-            plan=StepPlan(footstep, com, jnp.stack([before.body[2], after.body[2]])),
+            plan=StepPlan(footstep, com.position, jnp.stack([before.body[2], after.body[2]])),
             after=after,
-            com_velocity=com_velocity,
+            com_velocity=com.velocity[1],
         )
 
     def _next_stage(self, stage: IntScalar, wants: Bool[Array, ""], rests: Bool[Array, ""]) -> IntScalar:
@@ -289,34 +287,19 @@ class Walker:
         footstep: Footstep,
         after: Stance,
         stage: IntScalar,
-    ) -> tuple[Float[Array, "n 2"], Float[Array, "2"]]:
-        """Return the CoM of a step at its nodes, and its velocity at the end, in the frame of `before`."""
-        heights = com_heights(params, robot=self.robot)
-        duration = params.step_duration
-        share = params.double_support / duration
-        shares = zmp_shares(jnp.linspace(0.0, 1.0, NUM_NODES, dtype=share.dtype), share)
-        middle = jnp.where(stage == Stage.WALKING, footstep.support[:2], before.body[:2])
-        zmp = shares @ jnp.stack([before.body[:2], middle, after.body[:2]])
-        velocities = jax.vmap(com_velocities, in_axes=(1, 1, None, None, None))
-        solve = jax.vmap(com_trajectory, in_axes=(1, None, None, 0, 0, None), out_axes=1)
-        # Along x and, by Eq. 2 in place of Eq. 1, along y.
+    ) -> ComPlan:
+        """Plan the CoM of a step, in the frame of `before`."""
+        start, end = before.body[:2], after.body[:2]
+        support = jnp.where(stage == Stage.WALKING, footstep.support[:2], start)
         if self.com == "one_step":
-            com = solve(zmp, *heights, before.body[:2], after.body[:2], duration)  # Eq. 2
-            return com, velocities(com, zmp, *heights, duration)[:, 1]
+            return plan_com(params, start, support, end, robot=self.robot)
         # The step ends with the velocity with which the one-step solution of the step after it begins.
         following, then = next_footstep(params, after, wanted, robot=self.robot)
-        next_zmp = shares @ jnp.stack([after.body[:2], following.support[:2], then.body[:2]])
-        next_com = solve(next_zmp, *heights, after.body[:2], then.body[:2], duration)
-        next_velocity = velocities(next_com, next_zmp, *heights, duration)[:, 0]
+        next_com = plan_com(params, end, following.support[:2], then.body[:2], robot=self.robot)
         is_last = (stage == Stage.WALKING) & ~jnp.any(wanted != 0.0) & self._is_side_by_side(after)
         is_last = is_last | (stage == Stage.STOPPING) | (stage == Stage.STANDING)
-        end_velocity = jnp.where(is_last, 0.0, next_velocity)
-        start = _continued(state)
-        end = jnp.stack([after.body[:2], end_velocity], axis=1)
-        plan = jax.vmap(continuous_com_trajectory, in_axes=(1, None, None, None, 0, 0, None, 0), out_axes=1)
-        largest = jnp.asarray(LARGEST_SHIFT, share.dtype)
-        com, shifted = plan(zmp, shares[:, 1], *heights, start, end, duration, largest)
-        return com, velocities(com, shifted, *heights, duration)[:, 1]
+        wanted_end = jnp.stack([end, jnp.where(is_last, 0.0, next_com.velocity[0])])
+        return plan_continuous_com(params, _continued(state), start, support, wanted_end, robot=self.robot)
 
     def _is_side_by_side(self, stance: Stance) -> Bool[Array, ""]:
         spacing = jnp.zeros_like(stance.left).at[1].set(-self.robot.foot_spacing)
@@ -329,7 +312,7 @@ def _continued(state: WalkerState) -> Float[Array, "2 2"]:
     body = state.after.body
     position = relative_pose(body, jnp.append(state.plan.com[-1], body[2]))
     velocity = relative_pose(body.at[:2].set(0.0), jnp.append(state.com_velocity, body[2]))
-    return jnp.stack([position[:2], velocity[:2]], axis=1)
+    return jnp.stack([position[:2], velocity[:2]])
 
 
 def _in_place(stance: Stance) -> StepPlan:

@@ -148,7 +148,7 @@ def _constants(policy: Learned, walker: Walker) -> list[str]:
         "OUT_SIGN": robot.own_signs,
     }
     if walker.com == "continuous":
-        vectors["LARGEST_SHIFT"] = controller.LARGEST_SHIFT
+        vectors["LARGEST_SHIFT"] = engine.LARGEST_SHIFT
     flags = {
         "ONE_YAW_MOTOR": robot.has_one_yaw_motor,
         "IS_ONE_STEP": walker.com == "one_step",
