@@ -40,7 +40,18 @@ from creps_jax.simulation.models import load_nao
 from creps_jax.tasks import conditions, dmp, functions, planar_arm
 from creps_jax.tasks.steering import SteeringReward, record_drive
 from creps_jax.tasks.walking import WalkNoise, WalkReward, record_walk
-from creps_jax.walking import com, engine, footsteps, gaits, params, posture, set_points, swing, zmp
+from creps_jax.walking import (
+    com,
+    engine,
+    footsteps,
+    gaits,
+    open_loop,
+    params,
+    posture,
+    set_points,
+    swing,
+    zmp,
+)
 from creps_jax.walking.posture import Balance
 
 # What of an argument an error names, where it is a part of it.
@@ -463,11 +474,10 @@ MOTION = {
         footsteps.next_footstep, params=record(WALK), stance=record(footsteps.standing()), command=VECTOR
     ),
     "next_set_point": traced(set_points.next_set_point, set_point=JOINTS, target=JOINTS, period=number(0.02)),
-    "open_loop_set_points": traced(
-        set_points.open_loop_set_points,
-        params=record(WALK),
-        duration=number(1.0, above=0.0),
-        period=number(0.02, above=0.0),
+    "open_loop_walk": traced(
+        open_loop.open_loop_walk,
+        walker=record(WALKER),
+        commands=array(np.ones((2, 3)), free=(0,), bears=ANY),
     ),
     "params_from_theta": traced(params.params_from_theta, theta=array(np.ones(10), bears=ANY)),
     "plan_com": traced(engine.plan_com, params=record(WALK), start=PLANAR, support=PLANAR, end=PLANAR),
@@ -731,6 +741,9 @@ ROWS = {
         com=Argument("one_step", one_of(("two", "'two'"), (None, "None"), (3, "3"))),
     ),
     "steered_gait": traced(gaits.steered_gait, theta=array(np.ones(12), bears=ANY)),
+    "straight_walker": traced(
+        gaits.straight_walker, use=lambda walker: walker.start(), theta=array(np.ones(10), bears=ANY)
+    ),
     "straight_gait": traced(gaits.straight_gait, theta=array(np.ones(10), bears=ANY)),
     "linear_features": row(cj.linear_features, use=use_features, dim=count(2)),
     "linear_features.apply": row(FEATURES.apply, context=array(np.ones(1), bears=ANY)),

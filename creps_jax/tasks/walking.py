@@ -33,15 +33,11 @@ from creps_jax.tasks.conditions import Condition
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar
 from creps_jax.walking.controller import Walker
 from creps_jax.walking.engine import BodyPose
-from creps_jax.walking.gaits import straight_gait
+from creps_jax.walking.gaits import AHEAD, straight_walker
 from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS
 from creps_jax.walking.posture import Balance
 
 __all__ = ["WalkOutcome", "WalkRecord", "WalkReward", "nao_walk", "record_walk"]
-
-
-# Acceleration of a command that is followed at once.
-_AT_ONCE = (1e6, 1e6, 1e6)
 
 
 class WalkReward(NamedTuple):
@@ -175,7 +171,7 @@ def nao_walk(
     @checks.arguments
     def rollout(key: PRNGKey, context: Array, theta: Float[Array, "10"]) -> WalkOutcome:
         context = checks.array("context", context, (context_dim,))
-        walker = _straight_walker(theta, robot, balance)
+        walker = straight_walker(theta, robot=robot, period=CONTROL_PERIOD, balance=balance)
         walk, start = begin(setup, walker, key, context[1:])
         end = _walk_to_end(setup, walker, walk, start, start_up_ticks)
         return _measure(end, start_up_ticks, context[0], reward)
@@ -231,12 +227,12 @@ def record_walk(
     setup = make_setup(robot, model, duration, noise, conditions, physics)
     values = jnp.zeros(0, theta.dtype) if values is None else values
     values = checks.array("values", values, (len(conditions),), note=", one for each of the conditions")
-    walker = _straight_walker(theta, robot, balance)
+    walker = straight_walker(theta, robot=robot, period=CONTROL_PERIOD, balance=balance)
     walk, start = begin(setup, walker, key, values)
 
     def step(carry, tick):
         state, has_fallen = carry
-        state = advance(setup, walker, walk, tick, state, _ahead(theta.dtype))
+        state = advance(setup, walker, walk, tick, state, jnp.asarray(AHEAD, theta.dtype))
         has_fallen = has_fallen | is_fallen(setup, walk, state)
         pose = walker.pose(state.walker, walk.slope)
         return (state, has_fallen), (state.robot.qpos, state.walker.set_point, pose, has_fallen)
@@ -245,16 +241,6 @@ def record_walk(
     _, (qpos, set_point, pose, has_fallen) = lax.scan(step, (start, jnp.asarray(False)), ticks)
     time = (ticks + 1).astype(theta.dtype) * CONTROL_PERIOD
     return WalkRecord(time, qpos, set_point, pose, has_fallen)
-
-
-def _straight_walker(theta: Float[Array, "10"], robot: Robot, balance: Balance) -> Walker:
-    """Return the walker of the paper: straight ahead from the first control step on, each step by itself."""
-    return Walker(lambda _: straight_gait(theta), robot, CONTROL_PERIOD, balance, _AT_ONCE, "one_step")
-
-
-def _ahead(dtype: jnp.dtype) -> Float[Array, "3"]:
-    """Return a command straight ahead: the gait, not the command, says how fast."""
-    return jnp.array([1.0, 0.0, 0.0], dtype)
 
 
 def _walk_to_end(
@@ -267,7 +253,7 @@ def _walk_to_end(
 
     def step(progress: _Progress) -> _Progress:
         state = without_fallen(progress.state, progress.has_fallen)
-        state = advance(setup, walker, walk, progress.tick, state, _ahead(start.robot.qpos.dtype))
+        state = advance(setup, walker, walk, progress.tick, state, jnp.asarray(AHEAD, start.robot.qpos.dtype))
         tick = progress.tick + 1
         is_start_up = tick <= start_up_ticks
         measured_from = lax.select(is_start_up, state.robot.qpos[:2], progress.measured_from)

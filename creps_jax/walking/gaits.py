@@ -14,20 +14,26 @@ from creps_jax.walking.params import PARAM_NAMES, params_from_theta
 from creps_jax.walking.posture import Balance
 
 __all__ = [
+    "AHEAD",
     "COMMAND_NAMES",
     "COMMAND_UNITS",
     "learned_walker",
     "limited_command",
     "steered_gait",
     "straight_gait",
+    "straight_walker",
 ]
 
 COMMAND_NAMES = ("vx", "vy", "turn")
 """Names of the axes of a command."""
 COMMAND_UNITS = ("m/s", "m/s", "rad/s")
 """Their units."""
+AHEAD = (1.0, 0.0, 0.0)
+"""Command of a `straight_walker` that is to walk: its parameters, not the command, say how fast."""
 # What steps sideways (m) and turns (rad) are limited to, whatever theta says.
 LARGEST_SIDE, LARGEST_TURN = 0.2, 1.0
+# Acceleration of a command that is followed at once.
+_AT_ONCE = (1e6, 1e6, 1e6)
 _ROBOTS = {robot.name: robot for robot in (NAO, NAO_H25)}
 
 
@@ -37,6 +43,24 @@ def straight_gait(theta: Float[Array, "10"]) -> Gait:
     params = params_from_theta(theta)
     zero = jnp.zeros_like(params.step_length)
     return Gait(params, jnp.stack([params.step_length, zero, zero]))
+
+
+@checks.arguments
+def straight_walker(theta: Float[Array, "10"], **settings: Any) -> Walker:
+    """Make the walker of the paper: straight ahead from the first period on, each step solved for itself.
+
+    Args:
+        theta: Walking parameters in the paper's order and units.
+        settings: Settings of `Walker`, such as `robot` and `period`.
+
+    Returns:
+        The walker. It walks at the command `AHEAD`.
+
+    Raises:
+        ValueError: If theta has not one entry for each parameter, or a setting is out of its range.
+    """
+    once: dict[str, Any] = {"acceleration": _AT_ONCE, "com": "one_step"}
+    return Walker(lambda _: straight_gait(theta), **(once | settings))
 
 
 @checks.arguments

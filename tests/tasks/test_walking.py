@@ -14,10 +14,8 @@ from creps_jax.simulation.models import load_nao
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD, begin, make_setup
 from creps_jax.tasks.walking import WalkNoise, WalkReward, nao_walk, record_walk
 from creps_jax.training import evaluate
-from creps_jax.walking.controller import Walker
-from creps_jax.walking.gaits import straight_gait
-from creps_jax.walking.params import params_from_theta
-from creps_jax.walking.set_points import open_loop_set_points
+from creps_jax.walking.gaits import AHEAD, straight_walker
+from creps_jax.walking.open_loop import open_loop_walk
 from tests.oracles import walk_c
 
 # Gaits of about 0.08, 0.33 and 0.50 m/s, and one that trips at once.
@@ -98,17 +96,18 @@ def test_a_record_is_the_same_walk_with_the_speed_of_the_displacement(outcome):
 
 
 def test_set_points_of_a_trunk_that_leans_as_intended_are_the_open_loop_ones():
+    commands = jnp.tile(jnp.array(AHEAD), (100, 1))
+
     def stay(model, num_substeps):
         return lambda robot, before, after, speed: robot
 
     def walk(key, theta):
         quiet = WalkNoise(0.0, 0.0, 0.0)
         record = record_walk(key, theta, duration=2.0, noise=quiet, balance=BALANCE, physics=stay)
-        return record.set_point, open_loop_set_points(params_from_theta(theta), duration=2.0, period=0.02)
+        return record.set_point, open_loop_walk(straight_walker(theta), commands).set_point
 
     recorded, planned = jax.jit(walk)(jax.random.key(0), jnp.array(MIDDLE))
     assert jnp.abs(jnp.diff(planned, axis=0)).max() > 0.01
-    # The walk is planned in the frame of each step, the set-points in the world: they round differently.
     np.testing.assert_allclose(planned[1:], recorded, atol=1e-5)
 
 
@@ -132,7 +131,7 @@ def _start_of(theta):
     """Return the position in which a walk begins, without noise."""
     quiet = WalkNoise(0.0, 0.0, 0.0)
     setup = make_setup(NAO, None, 0.1, quiet, (), mjx.make_control_step)
-    walker = Walker(lambda _: straight_gait(theta), NAO, CONTROL_PERIOD)
+    walker = straight_walker(theta, period=CONTROL_PERIOD)
     _, start = begin(setup, walker, jax.random.key(0), jnp.zeros(0))
     return np.asarray(start.robot.qpos, float)
 

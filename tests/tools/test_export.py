@@ -297,6 +297,7 @@ def test_mistakes_are_one_clear_line(folder, capsys):
         ("is a policy of the robot nao, not of nao_h25", ["--to", "w.h", "--policy", str(SHIPPED), *H25]),
         ("its range, 0.1 to 0.6 m/s, got 0.9", ["--to", "walk.csv", "--speed", "0.9"]),
         ("--duration must be 0.02 to 600 s, got 0.0", [*walk, "--duration", "0"]),
+        ("--duration must be 0.02 to 600 s, got 0.01", [*walk, "--duration", "0.01"]),
         ("--duration must be 0.02 to 600 s, got nan", [*walk, "--duration", "nan"]),
         ("is the policy file itself", ["--to", "walk.npz", "--speed", "0.3", "--policy", "./walk.npz"]),
     ):

@@ -18,7 +18,8 @@ from creps_jax.robots.nao_geometry import (
     leg_indices,
 )
 from creps_jax.robots.nao_kinematics import leg_fk
-from creps_jax.walking.engine import joint_targets, plan_step, plan_walk, pose_at
+from creps_jax.robots.robot import NAO_H25
+from creps_jax.walking.engine import BodyPose, joint_targets, plan_step, plan_walk, pose_at, pose_joints
 from creps_jax.walking.footsteps import FOOT_SPACING, next_footstep, standing
 from creps_jax.walking.params import (
     AUTHOR_BOUNDS,
@@ -207,6 +208,21 @@ def test_without_gain_the_feet_stay_level_whatever_the_trunk_does():
     pitched, _ = sole_orientation(no_gain, jnp.array([0.0, 0.2, 0.0]))
     np.testing.assert_allclose(pitched[1], -0.2, atol=1e-5)
     np.testing.assert_allclose(orientation[0], -0.1, atol=0.01)
+
+
+def test_legs_that_share_a_motor_keep_their_soles_in_place_at_its_limit():
+    params = params_from_theta(THETA)
+    toes_in = [jnp.array([0.0, side * 0.05, 0.0, -side]) for side in (LEFT, RIGHT)]
+    pose = BodyPose(jnp.array([0.0, 0.0, 0.21, 0.0]), *toes_in, turn=jnp.float32(0.0))
+    targets = pose_joints(params, pose, jnp.zeros(3), robot=NAO_H25)
+    soles = []
+    for side in (LEFT, RIGHT):
+        leg = leg_indices(side)
+        np.testing.assert_allclose(targets[leg.start], NAO_H25.joint_upper[leg.start], rtol=1e-6)
+        soles.append(np.asarray(leg_fk(targets[leg], side, robot=NAO_H25)))
+    left, right = soles
+    np.testing.assert_allclose(left[:3, 3] - right[:3, 3], [0.0, 0.1, 0.0], atol=1e-5)
+    np.testing.assert_allclose([left[1, 2], right[1, 2]], 0.0, atol=1e-5)
 
 
 def test_hips_stand_at_the_asked_height_above_the_ankles():

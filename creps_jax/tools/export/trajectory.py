@@ -1,6 +1,5 @@
 """Write the joint set-points of a walk, for a robot that plays them."""
 
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,16 +11,15 @@ from jax import lax
 from creps_jax.errors import UserError
 from creps_jax.files import save_arrays, save_text
 from creps_jax.robots.nao_geometry import JOINT_NAMES
-from creps_jax.robots.robot import Robot
 from creps_jax.simulation import c
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD, WalkNoise, is_robot_fallen, make_setup, stand
 from creps_jax.tools import tables
 from creps_jax.tools.play import load_walking_policy, robot_of
-from creps_jax.walking.gaits import learned_walker
-from creps_jax.walking.params import params_from_theta
-from creps_jax.walking.set_points import open_loop_set_points
+from creps_jax.walking.controller import Walker
+from creps_jax.walking.gaits import AHEAD, straight_walker
+from creps_jax.walking.open_loop import open_loop_walk
 
-# Time and position grow during the walk, and lose digits in single precision.
+# A walk of this duration has 600,000 rows at the shortest period.
 _LONGEST = 600.0
 _SHORTEST_PERIOD, _LONGEST_PERIOD = 0.001, 0.1
 
@@ -33,13 +31,13 @@ class Trajectory(NamedTuple):
         speed: asked speed, m/s.
         time: (n,) time, s.
         set_point: (n, 22) angles in the order of `nao_geometry.JOINT_NAMES`, with its signs and zeros, rad.
-        robot: the robot.
+        walker: the walker that planned it.
     """
 
     speed: float
     time: np.ndarray
     set_point: np.ndarray
-    robot: Robot
+    walker: Walker
 
 
 def plan(
@@ -69,10 +67,11 @@ def plan(
         raise UserError(f"--period must be {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s, got {period}")
     if not period <= duration <= _LONGEST:
         raise UserError(f"--duration must be {period} to {_LONGEST:g} s, got {duration}")
-    theta, body = policy.theta(speed), robot_of(policy)
-    walk = partial(open_loop_set_points, duration=duration, period=period, robot=body)
-    set_point = np.asarray(jax.jit(lambda theta: walk(params_from_theta(theta)))(jnp.asarray(theta)))
-    return Trajectory(speed, np.arange(len(set_point)) * period, set_point, body)
+    walker = straight_walker(jnp.asarray(policy.theta(speed)), robot=robot_of(policy), period=period)
+    commands = jnp.tile(jnp.asarray(AHEAD), (round(duration / period), 1))
+    walk = jax.jit(lambda commands: open_loop_walk(walker, commands).set_point)
+    set_point = np.asarray(walk(commands))
+    return Trajectory(speed, np.arange(len(set_point)) * period, set_point, walker)
 
 
 def time_of_fall(path: Path, speed: float, duration: float, *, robot: str | None = None) -> float | None:
@@ -85,8 +84,7 @@ def time_of_fall(path: Path, speed: float, duration: float, *, robot: str | None
         robot: name of the robot that the policy must have; None accepts any.
     """
     walk = plan(path, speed, max(duration, 2 * CONTROL_PERIOD), robot=robot)
-    walker = learned_walker(load_walking_policy(path, robot))
-    setup = make_setup(walk.robot, None, duration, WalkNoise(0.0, 0.0, 0.0), (), c.make_control_step)
+    setup = make_setup(walk.walker.robot, None, duration, WalkNoise(0.0, 0.0, 0.0), (), c.make_control_step)
 
     def step(carry, pair):
         state, has_fallen = carry
@@ -96,7 +94,7 @@ def time_of_fall(path: Path, speed: float, duration: float, *, robot: str | None
         return (state, has_fallen), has_fallen
 
     def play(set_point):
-        start = stand(setup, walker, walker.start())
+        start = stand(setup, walk.walker, walk.walker.start())
         return lax.scan(step, (start, jnp.asarray(False)), (set_point[:-1], set_point[1:]))[1]
 
     has_fallen = np.asarray(jax.jit(play)(jnp.asarray(walk.set_point)))
@@ -109,7 +107,7 @@ def save_csv(path: Path, trajectory: Trajectory) -> None:
     Names and signs of the joints are those of the robot's own software.
     """
     columns: dict[str, list[object]] = {"time (s)": [f"{time:.9g}" for time in trajectory.time]}
-    robot = trajectory.robot
+    robot = trajectory.walker.robot
     signs = np.asarray(robot.own_signs, np.float32)
     for name, angles in zip(robot.own_names, (trajectory.set_point * signs).T, strict=True):
         # The shortest decimals that read back as the same single-precision number.
@@ -119,5 +117,5 @@ def save_csv(path: Path, trajectory: Trajectory) -> None:
 
 def save_npz(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory as .npz: speed (m/s), time (s), set_point (rad), joint_names of the simulation."""
-    arrays = {name: values for name, values in trajectory._asdict().items() if name != "robot"}
+    arrays = {name: values for name, values in trajectory._asdict().items() if name != "walker"}
     save_arrays(path, {**arrays, "joint_names": np.array(JOINT_NAMES)})
