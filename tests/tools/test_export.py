@@ -10,6 +10,8 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import onnx
 import onnxruntime
@@ -27,9 +29,12 @@ from creps_jax.robots.robot import NAO_H25
 from creps_jax.tools.cli import main
 from creps_jax.tools.export.c_header import make_header
 from creps_jax.tools.export.onnx_model import make_model
+from creps_jax.walking.gaits import learned_walker
+from creps_jax.walking.open_loop import open_loop_walk
 
 NAMES = ("a b", "a-b", 'what?? "\\')
 SHIPPED = policies_folder() / "walk.npz"
+STEERED = policies_folder() / "steer.npz"
 H25 = ("--robot", "nao_h25")
 NAN, INFINITE = float("nan"), float("inf")
 
@@ -265,6 +270,17 @@ def test_the_command_writes_the_set_points_of_a_walk(folder):
     np.testing.assert_array_equal(np.array(rows)[:, 1:].astype(np.float32), set_point)
 
 
+def test_a_steered_walk_is_written_as_its_walker_walks_straight_ahead(folder):
+    arguments = ["--to", "walk.npz", "--speed", "0.3", "--duration", "2", "--policy", str(STEERED)]
+    assert main(["export", *arguments]) == 0
+    walker = learned_walker(load(STEERED))
+    commands = jnp.tile(jnp.array([0.3, 0.0, 0.0]), (100, 1))
+    states = jax.jit(lambda commands: open_loop_walk(walker, commands))(commands)
+    np.testing.assert_allclose(load_arrays(folder / "walk.npz")["set_point"], states.set_point, atol=1e-5)
+    # As it was learned, the command rises by its acceleration.
+    assert 0.0 < states.command[20, 0] < 0.3 and states.origin[-1, 0] > 0.2
+
+
 def test_a_robot_gets_its_own_policy_and_set_points(folder, capsys):
     assert main(["export", "--robot", "nao_h25", "--to", "h25.npz", "--speed", "0.2", "--duration", "1"]) == 0
     shipped = policies_folder("nao_h25") / "walk.npz"
@@ -287,6 +303,7 @@ def test_mistakes_are_one_clear_line(folder, capsys):
     (folder / "file").touch()
     (folder / "folder.h").mkdir()
     walk = ["--to", "walk.csv", "--speed", "0.3"]
+    steered = ["--policy", str(STEERED)]
     for match, arguments in (
         ("cannot write file/walk.h", ["--to", "file/walk.h"]),
         ("cannot write folder.h: Is a directory", ["--to", "folder.h"]),
@@ -299,6 +316,15 @@ def test_mistakes_are_one_clear_line(folder, capsys):
         ("--duration must be 0.02 to 600 s, got 0.0", [*walk, "--duration", "0"]),
         ("--duration must be 0.02 to 600 s, got 0.01", [*walk, "--duration", "0.01"]),
         ("--duration must be 0.02 to 600 s, got nan", [*walk, "--duration", "nan"]),
+        *(
+            (f"--period must be 0.001 to 0.1 s, got {period}", [*where, "--period", period])
+            for period in ("0.0", "1.0", "nan")
+            for where in (walk, ["--to", "walk.c"])
+        ),
+        (
+            "vx must be within its range, -0.2 to 0.6 m/s, got 0.7",
+            ["--to", "walk.csv", "--speed", "0.7", *steered],
+        ),
         ("is the policy file itself", ["--to", "walk.npz", "--speed", "0.3", "--policy", "./walk.npz"]),
     ):
         assert main(["export", *arguments]) == 2, match

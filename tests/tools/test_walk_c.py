@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from jax import lax
 
-from creps_jax.errors import UserError
 from creps_jax.files import policies_folder
 from creps_jax.policies.learned import load
 from creps_jax.robots.nao_geometry import JOINT_NAMES
@@ -185,9 +184,3 @@ def test_the_real_nao_has_the_names_and_signs_of_its_own_software(tmp_path):
     # It bends with positive angles.
     assert NAO_H25.own_signs[knee] * NAO_H25.joint_lower[knee] > 1.0
     assert NAO.own_names == JOINT_NAMES and set(NAO.own_signs) == {1.0}
-
-
-@pytest.mark.parametrize("period", [0.0, 1.0, float("nan")])
-def test_a_bad_period_is_refused(period):
-    with pytest.raises(UserError, match="--period must be"):
-        walk_c.make_walk(policy_of("nao", "walk", "one_step"), period=period)

@@ -15,6 +15,7 @@ _WHOLE_WALK = {".c": "C code of the walk"}
 _OF_WALK = {".csv": "CSV table", ".npz": "NumPy arrays"}
 _DURATION = 8.0
 _PERIOD = 0.02
+_SHORTEST_PERIOD, _LONGEST_PERIOD = 0.001, 0.1
 
 
 def export(
@@ -78,7 +79,7 @@ def export(
 
 
 def _check_request(to: Path, ending: str, options: dict[str, float | None]) -> None:
-    """Refuse an unknown ending, and options that it does not have."""
+    """Refuse an unknown ending, options that it does not have, and a period out of its range."""
     endings = _OF_POLICY | _WHOLE_WALK | _OF_WALK
     if ending not in endings:
         raise UserError(f"--to must end in {', '.join(endings)}, got {to}")
@@ -89,6 +90,9 @@ def _check_request(to: Path, ending: str, options: dict[str, float | None]) -> N
         if value is not None and ending not in allowed:
             what = "the walk at every command" if ending in _WHOLE_WALK else "the policy, for every context"
             raise UserError(f"--{name} goes with {' and '.join(allowed)}: {to} is {what}")
+    period = options["period"]
+    if period is not None and not _SHORTEST_PERIOD <= period <= _LONGEST_PERIOD:
+        raise UserError(f"--period must be {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s, got {period}")
 
 
 def _are_the_same(path: Path, other: Path) -> bool:

@@ -16,12 +16,12 @@ from creps_jax.tasks.closed_loop import CONTROL_PERIOD, WalkNoise, is_robot_fall
 from creps_jax.tools import tables
 from creps_jax.tools.play import load_walking_policy, robot_of
 from creps_jax.walking.controller import Walker
-from creps_jax.walking.gaits import AHEAD, straight_walker
+from creps_jax.walking.gaits import AHEAD, COMMAND_NAMES, learned_walker, straight_walker
 from creps_jax.walking.open_loop import open_loop_walk
 
 # A walk of this duration has 600,000 rows at the shortest period.
 _LONGEST = 600.0
-_SHORTEST_PERIOD, _LONGEST_PERIOD = 0.001, 0.1
+_TASKS = ("walk", "steered walk")
 
 
 class Trajectory(NamedTuple):
@@ -43,14 +43,14 @@ class Trajectory(NamedTuple):
 def plan(
     path: Path, speed: float, duration: float, *, robot: str | None = None, period: float = CONTROL_PERIOD
 ) -> Trajectory:
-    """Plan a walk at a speed, by the walking engine without simulation.
+    """Plan a walk at a speed, without simulation.
 
     The trunk has its intended lean at all times, without noise. There is no posture feedback, which needs the
     measured lean: a robot that plays this walk must keep its balance by other means, or walk where little
     disturbs it.
 
     Args:
-        path: policy file.
+        path: policy file; a steered walk walks straight ahead.
         speed: asked speed, m/s.
         duration: length of the walk, s.
         robot: name of the robot that the policy must have; None accepts any.
@@ -60,15 +60,18 @@ def plan(
         UserError: if it is not a walking policy, or of another robot, or if speed or duration are out of
             range.
     """
-    policy = load_walking_policy(path, robot)
-    if policy.task.get("name") != "walk":
+    policy = load_walking_policy(path, robot, can_steer=True)
+    if policy.task.get("name") not in _TASKS:
         raise UserError(f"{path} is no walking policy: its task is {policy.task.get('name')!r}")
-    if not _SHORTEST_PERIOD <= period <= _LONGEST_PERIOD:
-        raise UserError(f"--period must be {_SHORTEST_PERIOD:g} to {_LONGEST_PERIOD:g} s, got {period}")
     if not period <= duration <= _LONGEST:
         raise UserError(f"--duration must be {period} to {_LONGEST:g} s, got {duration}")
-    walker = straight_walker(jnp.asarray(policy.theta(speed)), robot=robot_of(policy), period=period)
-    commands = jnp.tile(jnp.asarray(AHEAD), (round(duration / period), 1))
+    if policy.contexts.names == COMMAND_NAMES:
+        command = policy.contexts.checked((speed, 0.0, 0.0))
+        walker = learned_walker(policy, period=period)
+    else:
+        command = AHEAD
+        walker = straight_walker(jnp.asarray(policy.theta(speed)), robot=robot_of(policy), period=period)
+    commands = jnp.tile(jnp.asarray(command, jnp.float32), (round(duration / period), 1))
     walk = jax.jit(lambda commands: open_loop_walk(walker, commands).set_point)
     set_point = np.asarray(walk(commands))
     return Trajectory(speed, np.arange(len(set_point)) * period, set_point, walker)

@@ -21,7 +21,6 @@ from creps_jax.walking import controller, engine, footsteps, gaits, params, post
 from creps_jax.walking.controller import Walker
 from creps_jax.walking.gaits import COMMAND_NAMES, learned_walker
 
-_PERIODS = (0.001, 0.1)
 _KINDS = ("linear", "polynomial", "rbf")
 
 
@@ -34,7 +33,7 @@ def save(path: Path, policy: Learned, *, period: float = 0.02) -> None:
         period: time between two set-points, s.
 
     Raises:
-        UserError: if the policy is no walk, the period is out of its range, or a file cannot be written.
+        UserError: if the policy is no walk, or a file cannot be written.
     """
     header = path.with_suffix(".h")
     code, declarations = make_walk(policy, path.stem, period=period)
@@ -48,8 +47,6 @@ def make_walk(policy: Learned, name: str = "walk", *, period: float = 0.02) -> t
     Raises:
         UserError: as `save` does.
     """
-    if not _PERIODS[0] <= period <= _PERIODS[1]:
-        raise UserError(f"--period must be {_PERIODS[0]} to {_PERIODS[1]} s, got {period}")
     try:
         walker = learned_walker(policy, period=period)
     except (TypeError, ValueError) as error:
