@@ -18,8 +18,10 @@ from creps_jax.tasks.closed_loop import WalkNoise
 from creps_jax.tasks.walking import record_walk
 from creps_jax.tools import plots
 from creps_jax.tools.play import balance_of, load_walking_policy, shipped_policy
-from creps_jax.walking.engine import plan_walk
-from creps_jax.walking.params import params_from_theta
+from creps_jax.typing import Scalar
+from creps_jax.walking.controller import WalkerState
+from creps_jax.walking.gaits import AHEAD, straight_walker
+from creps_jax.walking.open_loop import open_loop_walk
 from creps_jax.walking.posture import Balance
 from creps_jax.walking.zmp import zmp_reference
 from experiments.learning import Session
@@ -107,22 +109,21 @@ class _Walker:
 
 
 def _plan(theta: jax.Array, times: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the lateral plan of the paper's engine at some times."""
-    params = params_from_theta(theta)
-    duration = float(params.step_duration)
-    plans = jax.tree.map(
-        np.asarray, jax.jit(plan_walk, static_argnums=1)(params, int(times[-1] / duration) + 2)
-    )
-    index, phase = (times // duration).astype(int), times / duration % 1.0
-    step = plans.footstep
-    start, end = 0.5 * (step.support + step.swing_start), 0.5 * (step.support + step.swing_end)
-    share = params.double_support / params.step_duration
-    reference = jax.jit(jax.vmap(lambda t, a, b, c: zmp_reference(t[None], a, b, c, share)[0]))
-    zmp = reference(*(jnp.float32(x) for x in (phase, *(x[index, :2] for x in (start, step.support, end)))))
-    nodes = np.linspace(0.0, 1.0, plans.com.shape[1])
-    com = np.array([np.interp(p, nodes, plans.com[i, :, 1]) for i, p in zip(index, phase, strict=True)])
-    middle = np.where(phase < 0.5, start[index, 1], end[index, 1])
-    return {"zmp_plan": np.asarray(zmp)[:, 1] - middle, "com_plan": com - middle}
+    """Return the lateral plan of the walk without feedback, at times with equal distances from 0 on."""
+    walker = straight_walker(theta, period=float(times[1]))
+
+    def lateral(state: WalkerState) -> tuple[Scalar, Scalar]:
+        params, com, step = state.gait.params, state.plan.com, state.plan.footstep
+        phase = state.time / params.step_duration
+        start, end = (0.5 * (step.support + swing)[:2] for swing in (step.swing_start, step.swing_end))
+        share = params.double_support / params.step_duration
+        zmp = zmp_reference(phase[None], start, step.support[:2], end, share)[0, 1]
+        middle = jnp.where(phase < 0.5, start[1], end[1])
+        return zmp - middle, jnp.interp(phase, jnp.linspace(0.0, 1.0, len(com)), com[:, 1]) - middle
+
+    commands = jnp.tile(jnp.array(AHEAD), (len(times) - 1, 1))
+    zmp, com = jax.jit(lambda given: jax.vmap(lateral)(open_loop_walk(walker, given)))(commands)
+    return {"zmp_plan": np.asarray(zmp), "com_plan": np.asarray(com)}
 
 
 def inside(arrays: Arrays, name: str) -> dict[str, np.ndarray]:

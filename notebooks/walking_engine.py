@@ -38,10 +38,12 @@ import mujoco
 import numpy as np
 
 import creps_jax as cj
-from creps_jax.robots.nao_geometry import GEOMETRY, JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
+from creps_jax.robots.nao_geometry import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
 from creps_jax.tools.plots import COLOURS
-from creps_jax.walking.com import spring_height, zmp_of_com
-from creps_jax.walking.engine import NUM_NODES, plan_walk, pose_at, pose_joints
+from creps_jax.walking.com import zmp_of_com
+from creps_jax.walking.engine import NUM_NODES, com_heights, pose_joints
+from creps_jax.walking.gaits import AHEAD, straight_walker
+from creps_jax.walking.open_loop import open_loop_walk
 from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS, params_from_theta
 from creps_jax.walking.zmp import zmp_reference
 
@@ -52,38 +54,48 @@ for name, value, unit in zip(PARAM_NAMES, theta, PARAM_UNITS, strict=True):
     print(f"    {name:15} {value:6.3f} {unit}")
 
 # %% [markdown]
-# The next cell compiles eight steps as one function of the ten parameters. `plan_walk` plans from the
-# footsteps to the CoM, `pose_at` computes hips and feet, and `pose_joints` computes the joint angles.
-# `plan_walk` does not return the ZMP. The cell therefore computes the ZMP reference again, and also the
-# ZMP of the planned CoM.
+# The next cell compiles eight steps as one function of the ten parameters. `straight_walker` makes the
+# walker of these parameters, and `open_loop_walk` returns its state in each control period. A state holds
+# the plan of its step, from the footsteps to the CoM, in the frame of the start of the step, `origin`. The
+# cell takes a state from each step and moves its time through the step: `pose` computes hips and feet, and
+# `pose_joints` the joint angles. A plan does not hold the ZMP. The cell therefore computes the ZMP reference
+# again, and also the ZMP of the planned CoM.
 
 # %%
-NUM_STEPS, NUM_TIMES = 8, 401
+NUM_STEPS, PER_STEP = 8, 50
+LONGEST = 0.4  # The longest duration of a step in this notebook, s.
+
+
+def zmps(state):
+    params, plan = state.gait.params, state.plan
+    phase, share = jnp.linspace(0, 1, NUM_NODES), params.double_support / params.step_duration
+    asked = zmp_reference(phase, plan.com[0], plan.footstep.support[:2], plan.com[-1], share)
+    real = [zmp_of_com(axis, *com_heights(params), params.step_duration) for axis in plan.com.T]
+    return asked, jnp.stack(real, axis=1)
 
 
 @jax.jit
 def engine(theta):
-    params = params_from_theta(theta)
-    plans = plan_walk(params, NUM_STEPS)
-    times = jnp.linspace(0, NUM_STEPS * params.step_duration, NUM_TIMES)
-    poses = jax.vmap(lambda time: pose_at(params, plans, time))(times)
+    params, walker = params_from_theta(theta), straight_walker(theta)
+    num_periods = round(NUM_STEPS * LONGEST / walker.period)
+    states = open_loop_walk(walker, jnp.tile(jnp.array(AHEAD), (num_periods, 1)))
+    middles = (jnp.arange(NUM_STEPS) + 0.5) * params.step_duration / walker.period
+    steps = jax.tree.map(lambda leaf: leaf[middles.astype(int)], states)
+
+    # The walk is straight: the frames of its steps are moved, and not turned.
+    in_steps = (steps.plan.footstep.support[:, None, :2], steps.plan.com, *jax.vmap(zmps)(steps))
+    planned = [points + steps.origin[:, None, :2] for points in in_steps]
+
+    ticks = jnp.arange(NUM_STEPS * PER_STEP)
+    states = jax.tree.map(lambda leaf: leaf[ticks // PER_STEP], steps)
+    phase = ticks % PER_STEP / PER_STEP
+    poses = jax.vmap(walker.pose)(states._replace(time=phase * params.step_duration))
     upright = jnp.stack([0.0, params.lean, 0.0])
     joints = jax.vmap(lambda pose: pose_joints(params, pose, upright))(poses)
-
-    phase = jnp.linspace(0, 1, NUM_NODES)
-    share = params.double_support / params.step_duration
-    height, acceleration = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
-    height = height + GEOMETRY.ankle_height + 0.025  # The CoM is that far above the hips.
-
-    def zmps(plan):
-        asked = zmp_reference(phase, plan.com[0], plan.footstep.support[:2], plan.com[-1], share)
-        real = [zmp_of_com(axis, height, acceleration, params.step_duration) for axis in plan.com.T]
-        return asked, jnp.stack(real, axis=1)
-
-    return params, plans, *jax.vmap(zmps)(plans), times, poses, joints
+    return params, planned, ticks * params.step_duration / PER_STEP, poses, joints
 
 
-params, plans, asked, real, times, poses, joints = jax.tree.map(np.asarray, engine(theta))
+params, (support, com, asked, real), times, poses, joints = jax.tree.map(np.asarray, engine(theta))
 
 # %% [markdown]
 # ## From footsteps to the centre of mass
@@ -96,17 +108,17 @@ params, plans, asked, real, times, poses, joints = jax.tree.map(np.asarray, engi
 # %%
 figure, (above, sideways) = plt.subplots(1, 2, figsize=(14, 3.4), width_ratios=(3, 2))
 outline = np.array([[-0.05, 0.11, 0.11, -0.05], [-0.04, -0.04, 0.04, 0.04]]) - [[0.02], [0.0]]
-for place, is_left in zip(plans.footstep.support, plans.footstep.supports_left, strict=True):
-    above.fill(*(outline + place[:2, None]), color=COLOURS[3 if is_left else 4], alpha=0.2)
+for place in support[:, 0]:
+    above.fill(*(outline + place[:, None]), color=COLOURS[3 if place[1] > 0 else 4], alpha=0.2)
 above.plot(*asked.reshape(-1, 2).T, color=COLOURS[1])
-above.plot(*plans.com.reshape(-1, 2).T, color=COLOURS[0])
+above.plot(*com.reshape(-1, 2).T, color=COLOURS[0])
 above.set(xlabel="forward (m)", ylabel="left (m)", title="Eight steps from above", aspect="equal")
 
 steps = np.arange(NUM_STEPS)[:, None] + np.linspace(0, 1, NUM_NODES)
 clock = params.step_duration * steps
 sideways.plot(clock[:4].ravel(), asked[:4, :, 1].ravel(), color=COLOURS[1], label="ZMP reference")
 sideways.plot(clock[:4, 1:-1].ravel(), real[:4, :, 1].ravel(), "k.", markersize=3, label="ZMP of the CoM")
-sideways.plot(clock[:4].ravel(), plans.com[:4, :, 1].ravel(), color=COLOURS[0], label="CoM")
+sideways.plot(clock[:4].ravel(), com[:4, :, 1].ravel(), color=COLOURS[0], label="CoM")
 sideways.set(xlabel="time (s)", ylabel="left (m)", title="Sideways", ylim=(-0.065, 0.1))
 sideways.legend(loc="upper center", ncols=3, fontsize=8)
 plt.show()
@@ -185,9 +197,9 @@ def vary(name, values):
         yield {"color": colour, "label": f"{value:g}"}, jax.tree.map(np.asarray, engine(changed))
 
 
-for style, (_, plans, *_) in vary("step_duration", (0.2, 0.3, 0.4)):
-    sway.plot(steps[:2].ravel(), plans.com[4:6, :, 1].ravel(), **style)
-for style, (_, _, asked, *_) in vary("double_support", (0.0, 0.05, 0.1)):
+for style, (_, (_, com, _, _), *_) in vary("step_duration", (0.2, 0.3, 0.4)):
+    sway.plot(steps[:2].ravel(), com[4:6, :, 1].ravel(), **style)
+for style, (_, (_, _, asked, _), *_) in vary("double_support", (0.0, 0.05, 0.1)):
     zmp.plot(steps[:2].ravel(), asked[4:6, :, 1].ravel(), **style)
 for style, (*_, poses, _) in vary("swing_height", (0.02, 0.04, 0.06)):
     foot.plot(poses.left[250:301, 0], poses.left[250:301, 2], **style)

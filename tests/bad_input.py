@@ -351,9 +351,7 @@ LEARNED.save(FOLDER / "policy.npz")
 NO_PATH = one_of((None, "None"), (5, "5"), (["a"], "['a']"))
 MODEL = load_nao()
 WALK = params.params_from_theta(jnp.asarray(np.mean(params.NAO_BOUNDS, axis=0), jnp.float32))
-PLANS = jax.eval_shape(lambda: engine.plan_walk(WALK, 3))
-PLAN = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), PLANS)
-PLANS = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), PLANS)
+PLAN = WALKER.start().plan
 POSE = engine.BodyPose(jnp.zeros(4), jnp.zeros(4), jnp.zeros(4), jnp.zeros(()))
 VECTOR = array(np.ones(3), bears=ANY)
 PLANAR = array(np.ones(2), bears=ANY)
@@ -440,7 +438,6 @@ MOTION = {
         roll_gain=SCALAR,
         tilt_gain=SCALAR,
     ),
-    "count_steps": made(params.count_steps, duration=number(8.0)),
     "dmp_trajectory": traced(
         dmp.dmp_trajectory,
         weights=array(np.ones((3, 2)), free=(0,), bears=ANY),
@@ -460,14 +457,6 @@ MOTION = {
         depth=number(1.0),
     ),
     "hole_movement": traced(planar_arm.hole_movement, theta=array(np.ones(18), bears=ANY)),
-    "joint_targets": traced(
-        engine.joint_targets,
-        params=record(WALK),
-        plans=record(PLANS),
-        time=SCALAR,
-        measured_rpy=VECTOR,
-        balance=BALANCE,
-    ),
     "leg_indices": made(nao_geometry.leg_indices, side=WALK_POSES["side"]),
     "matrix_to_rpy": traced(rotations.matrix_to_rpy, rotation=MATRIX),
     "next_footstep": traced(
@@ -489,11 +478,6 @@ MOTION = {
         support=PLANAR,
         end=array(np.ones((2, 2)), bears=ANY),
     ),
-    "plan_step": traced(
-        engine.plan_step, params=record(WALK), stance=record(footsteps.standing()), command=VECTOR
-    ),
-    "plan_walk": traced(engine.plan_walk, params=record(WALK), num_steps=count(3), command=optional(VECTOR)),
-    "pose_at": traced(engine.pose_at, params=record(WALK), plans=record(PLANS), time=SCALAR),
     "pose_joints": traced(
         engine.pose_joints, params=record(WALK), pose=record(POSE), measured_rpy=VECTOR, balance=BALANCE
     ),

@@ -1,11 +1,10 @@
-"""Turn walking parameters into joint targets: plan a step, pose body and joints."""
+"""Turn walking parameters into joint targets: plan the CoM of a step, pose body and joints."""
 
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
 from creps_jax import checks
 from creps_jax.numerics.curves import smooth_step
@@ -20,7 +19,7 @@ from creps_jax.walking.com import (
     continuous_com_trajectory,
     spring_height,
 )
-from creps_jax.walking.footsteps import Footstep, Stance, next_footstep, standing
+from creps_jax.walking.footsteps import Footstep
 from creps_jax.walking.params import WalkParams
 from creps_jax.walking.posture import Balance, corrected_lean
 from creps_jax.walking.swing import swing_pose
@@ -32,12 +31,8 @@ __all__ = [
     "StepPlan",
     "body_pose",
     "com_heights",
-    "joint_targets",
     "plan_com",
     "plan_continuous_com",
-    "plan_step",
-    "plan_walk",
-    "pose_at",
     "pose_joints",
     "stand_upright",
 ]
@@ -98,28 +93,6 @@ class BodyPose(NamedTuple):
     left: Float[Array, "4"]
     right: Float[Array, "4"]
     turn: Scalar
-
-
-@checks.arguments
-def plan_step(
-    params: WalkParams, stance: Stance, command: Float[Array, "3"], *, robot: Robot = NAO
-) -> tuple[StepPlan, Stance]:
-    """Plan one step: footstep, ZMP reference, CoM trajectory.
-
-    Args:
-        params: Walking parameters.
-        stance: Where the feet stand.
-        command: Wanted displacement (x forward, y left, yaw) of the body in one step, m and rad.
-        robot: Who walks.
-
-    Returns:
-        The plan of the step, and the stance after it.
-
-    Source: Abdolmaleki et al. 2016, Section 2.
-    """
-    footstep, after = next_footstep(params, stance, command, robot=robot)
-    com = plan_com(params, stance.body[:2], footstep.support[:2], after.body[:2], robot=robot)
-    return StepPlan(footstep, com.position, jnp.stack([stance.body[2], after.body[2]])), after
 
 
 @checks.arguments
@@ -205,33 +178,6 @@ def com_heights(params: WalkParams, *, robot: Robot = NAO) -> tuple[Float[Array,
     phase = _node_phases(params)
     height, height_acc = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
     return height + (robot.geometry.ankle_height + robot.com_above_hip), height_acc
-
-
-@checks.arguments
-def plan_walk(
-    params: WalkParams, num_steps: int, command: Float[Array, "3"] | None = None, *, robot: Robot = NAO
-) -> StepPlan:
-    """Plan a walk from standstill.
-
-    Args:
-        params: Walking parameters.
-        num_steps: Number of steps.
-        command: Wanted displacement of the body in one step; straight ahead by `params.step_length` if
-            left out.
-        robot: Who walks.
-
-    Returns:
-        The plans of the steps, stacked along a leading axis.
-    """
-    dtype = params.step_length.dtype
-    if command is None:
-        command = params.step_length * jnp.array([1.0, 0.0, 0.0], dtype)
-
-    def plan_next(stance, _):
-        plan, after = plan_step(params, stance, command, robot=robot)
-        return after, plan
-
-    return lax.scan(plan_next, standing(dtype, robot=robot), length=num_steps)[1]
 
 
 @checks.arguments
@@ -377,40 +323,3 @@ def _head_and_arms(left_foot_ahead):
     left = [SHOULDER_PITCH - swing, SHOULDER_YAW, -ARM_ROLL, -ELBOW]
     right = [SHOULDER_PITCH + swing, -SHOULDER_YAW, ARM_ROLL, ELBOW]
     return jnp.stack([jnp.asarray(angle, left_foot_ahead.dtype) for angle in [0.0, 0.0, *left, *right]])
-
-
-@checks.arguments
-def joint_targets(
-    params: WalkParams,
-    plans: StepPlan,
-    time: Scalar,
-    measured_rpy: Float[Array, "3"],
-    *,
-    balance: Balance = Balance(),
-    robot: Robot = NAO,
-) -> Float[Array, "22"]:
-    """Return the joint targets of a planned walk at a time.
-
-    Args:
-        params: Walking parameters.
-        plans: Plans of the steps, stacked (see `plan_walk`).
-        time: Time since the start of the first step, s; after the last step the robot holds its last pose.
-        measured_rpy: Measured roll, pitch and yaw of the trunk, rad.
-        balance: See `pose_joints`.
-        robot: Who walks.
-
-    Returns:
-        Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad.
-    """
-    pose = pose_at(params, plans, time, robot=robot)
-    return pose_joints(params, pose, measured_rpy, balance=balance, robot=robot)
-
-
-@checks.arguments
-def pose_at(params: WalkParams, plans: StepPlan, time: Scalar, *, robot: Robot = NAO) -> BodyPose:
-    """Return the body pose of a planned walk at a time (see `joint_targets`)."""
-    num_steps = plans.yaw.shape[0]
-    steps = time / params.step_duration
-    index = jnp.clip(jnp.floor(steps), 0.0, num_steps - 1.0)
-    plan = jax.tree.map(lambda leaf: leaf[index.astype(jnp.int32)], plans)
-    return body_pose(params, plan, steps - index, robot=robot)

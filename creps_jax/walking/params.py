@@ -21,7 +21,6 @@ __all__ = [
     "STEERED_PARAM_NAMES",
     "STEERED_PARAM_UNITS",
     "WalkParams",
-    "count_steps",
     "params_from_theta",
 ]
 
@@ -97,9 +96,8 @@ NAO_STEERED_BOUNDS = (
 )
 """Bounds of a NAO's steered walk: `NAO_BOUNDS`, with steps backward, sideways and turning."""
 
-_SHORTEST_STEP = 0.08
 # What the engine accepts, whatever theta says. Within it every plan is finite.
-SAFE_LOW = (0.0, 0.10, 0.0, _SHORTEST_STEP, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
+SAFE_LOW = (0.0, 0.10, 0.0, 0.08, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
 SAFE_HIGH = (1.0, 0.22, 0.15, 4.0, 30.0, 2.0, 2.0, 0.2, 4.0, 10.0)
 # Amplitude at which the spring's acceleration would reach that of gravity is A = g T^2 / (4 pi^2): there
 # the ZMP equation is singular. Share of it that is allowed.
@@ -165,13 +163,3 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
         lean=params.lean * (math.pi / 180.0),
         double_support=jnp.minimum(params.double_support, MAX_DOUBLE_SUPPORT_SHARE * duration),
     )
-
-
-@checks.arguments
-def count_steps(duration: float) -> int:
-    """Return how many steps at most a walk can have, with any parameters of `params_from_theta`.
-
-    Args:
-        duration: Length of the walk, s.
-    """
-    return round(duration / _SHORTEST_STEP) + 1

@@ -1,23 +1,24 @@
-"""Walk the NAO in C MuJoCo, with a loop of its own around the same engine."""
+"""Walk the NAO in C MuJoCo, with a loop of its own around the same walker."""
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from creps_jax.robots.nao_geometry import MAX_JOINT_SPEED
-from creps_jax.walking.engine import joint_targets, plan_walk
-from creps_jax.walking.params import params_from_theta
+from creps_jax.walking.gaits import AHEAD, straight_walker
 from creps_jax.walking.posture import Balance
 
 CONTROL_PERIOD = 0.02
-NUM_STEPS = 60
 BALANCE = Balance(heading_gain=0.3, placement_gain=0.6)
 
 
+def _walker(theta):
+    return straight_walker(theta, period=CONTROL_PERIOD, balance=BALANCE)
+
+
 @jax.jit
-def _targets(theta, time, measured):
-    params = params_from_theta(theta)
-    return joint_targets(params, plan_walk(params, NUM_STEPS), time, measured, balance=BALANCE)
+def _next(theta, state, measured):
+    return _walker(theta).step(state, jnp.array(AHEAD), measured)
 
 
 def servo_step(model, data, before, after, speed):
@@ -47,14 +48,12 @@ def walk(model, qpos, theta, *, duration, noise, seed):
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     data.qpos[7:] += noise * rng.standard_normal(model.nu)
-    set_point, start_x = np.array(qpos[7:], float), 0.0
+    state, set_point, start_x = _walker(theta).start(), np.array(qpos[7:], float), 0.0
     miss = np.zeros(model.nu)
     for tick in range(round(duration / CONTROL_PERIOD)):
         measured = lean_of(data.qpos[3:7]) + noise * rng.standard_normal(3)
-        time = np.float32((tick + 1) * CONTROL_PERIOD)
-        target = np.asarray(_targets(theta, time, measured.astype(np.float32)), float)
-        slew = MAX_JOINT_SPEED * CONTROL_PERIOD
-        target = set_point + np.clip(target - set_point, -slew, slew)
+        state, target = _next(theta, state, measured.astype(np.float32))
+        target = np.asarray(target, float)
         next_miss = noise * rng.standard_normal(model.nu)
         speed = (target - set_point) / CONTROL_PERIOD
         servo_step(model, data, set_point + miss, target + next_miss, speed)

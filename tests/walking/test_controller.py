@@ -1,5 +1,6 @@
 """The walker follows commands, continues the motion of the CoM from step to step, stops and starts."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -10,9 +11,9 @@ from jax import lax
 
 from creps_jax.walking.com import com_velocities
 from creps_jax.walking.controller import Gait, Stage, Walker
-from creps_jax.walking.engine import com_heights, plan_walk, pose_at
-from creps_jax.walking.footsteps import relative_pose
-from creps_jax.walking.gaits import limited_command, straight_gait
+from creps_jax.walking.engine import StepPlan, body_pose, com_heights, plan_com
+from creps_jax.walking.footsteps import next_footstep, relative_pose, standing
+from creps_jax.walking.gaits import AHEAD, limited_command, straight_walker
 from creps_jax.walking.params import params_from_theta
 from creps_jax.walking.posture import Balance
 
@@ -41,13 +42,31 @@ def constant(command, num):
     return jnp.tile(jnp.asarray(command, jnp.float32), (num, 1))
 
 
-def test_the_one_step_walk_is_the_walk_that_is_planned_in_advance():
-    params = params_from_theta(THETA)
-    plans = plan_walk(params, 12)
-    times = 0.011 * jnp.arange(1.0, 200.0)
-    wanted = jax.vmap(lambda time: pose_at(params, plans, time))(times)
-    walker = Walker(lambda _: straight_gait(THETA), period=0.011, com="one_step", acceleration=(1e6,) * 3)
-    states, _ = walk(walker, constant([1.0, 0.0, 0.0], 199))
+def planned_in_the_world(params, step, times):
+    """Plan a walk of twelve equal steps in advance, in the frame of the world, and return its poses."""
+
+    def plan_next(stance, _):
+        footstep, after = next_footstep(params, stance, step)
+        com = plan_com(params, stance.body[:2], footstep.support[:2], after.body[:2])
+        return after, StepPlan(footstep, com.position, jnp.stack([stance.body[2], after.body[2]]))
+
+    plans = lax.scan(plan_next, standing(), length=12)[1]
+
+    def pose_at(time):
+        phase = time / params.step_duration
+        plan = jax.tree.map(lambda leaf: leaf[phase.astype(jnp.int32)], plans)
+        return body_pose(params, plan, phase % 1.0)
+
+    return jax.vmap(pose_at)(times)
+
+
+@pytest.mark.parametrize("step", [(0.05, 0.0, 0.0), (0.03, 0.02, 0.1), (-0.03, -0.02, -0.1)])
+def test_the_one_step_walk_is_the_walk_that_is_planned_in_advance(step):
+    params, step = params_from_theta(THETA), jnp.array(step)
+    wanted = jax.jit(planned_in_the_world)(params, step, 0.011 * jnp.arange(1.0, 200.0))
+    walker = straight_walker(THETA, period=0.011)
+    walker = dataclasses.replace(walker, gait=lambda _: Gait(params, step))
+    states, _ = walk(walker, constant(AHEAD, 199))
     found = jax.vmap(walker.pose)(states)
     for name in wanted._fields:
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), atol=1e-4, err_msg=name)

@@ -1,5 +1,8 @@
 """The walking engine: footsteps, swing, posture, and joint targets that are safe for every theta."""
 
+import dataclasses
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,8 +22,11 @@ from creps_jax.robots.nao_geometry import (
 )
 from creps_jax.robots.nao_kinematics import leg_fk
 from creps_jax.robots.robot import NAO_H25
-from creps_jax.walking.engine import BodyPose, joint_targets, plan_step, plan_walk, pose_at, pose_joints
-from creps_jax.walking.footsteps import FOOT_SPACING, next_footstep, standing
+from creps_jax.walking.controller import Gait
+from creps_jax.walking.engine import BodyPose, pose_joints
+from creps_jax.walking.footsteps import FOOT_SPACING, compose, next_footstep, standing
+from creps_jax.walking.gaits import AHEAD, straight_walker
+from creps_jax.walking.open_loop import open_loop_walk
 from creps_jax.walking.params import (
     AUTHOR_BOUNDS,
     NAO_BOUNDS,
@@ -36,21 +42,54 @@ from creps_jax.walking.posture import Balance, corrected_lean
 from creps_jax.walking.swing import swing_pose
 
 THETA = jnp.array([0.001, 0.176, 0.039, 0.224, 0.0, 0.5, 0.5, 0.07, 0.04, 0.1])
+DURATION = 0.224  # of a step of THETA, s
 LEVEL = jnp.zeros(3)
 NUM_STEPS = 12
 BALANCE = Balance(heading_gain=0.3, placement_gain=0.6)
 LEFT_LEG, RIGHT_LEG = leg_indices(LEFT), leg_indices(RIGHT)
 
 
-@jax.jit
-def targets_of(theta, time, measured):
-    params = params_from_theta(theta)
-    return joint_targets(params, plan_walk(params, NUM_STEPS), time, measured, balance=BALANCE)
+def ahead(num):
+    return jnp.tile(jnp.array(AHEAD), (num, 1))
 
 
 @jax.jit
-def walk_of(theta, command):
-    return plan_walk(params_from_theta(theta), NUM_STEPS, command)
+def walk_of(theta):
+    """Return the states of a walk of 3 s, every 0.05 s."""
+    return open_loop_walk(straight_walker(theta, period=0.05), ahead(60))
+
+
+@jax.jit
+def targets_of(theta, state, measured):
+    """Return the joint targets of a state."""
+    pose = straight_walker(theta).pose(state)
+    return pose_joints(params_from_theta(theta), pose, measured, balance=BALANCE)
+
+
+@partial(jax.jit, static_argnames="num")
+def steps_of(theta, command=None, num=NUM_STEPS):
+    """Return a state in the middle of each step of a walk with the duration of `THETA`."""
+    walker = straight_walker(theta, period=0.5 * DURATION)
+    if command is not None:
+        walker = dataclasses.replace(walker, gait=lambda _: Gait(params_from_theta(theta), command))
+    states = open_loop_walk(walker, ahead(2 * num))
+    return jax.tree.map(lambda leaf: leaf[1::2], states)
+
+
+def at_phase(state, phase):
+    return state._replace(time=jnp.float32(phase * DURATION))
+
+
+def in_world(states):
+    """Return the poses of support foot and landing foot, and the CoM at the nodes, in the world."""
+
+    def of_one(state):
+        to_world = jax.vmap(compose, in_axes=(None, 0))
+        com = jnp.pad(state.plan.com, ((0, 0), (0, 1)))
+        feet = jnp.stack([state.plan.footstep.support, state.plan.footstep.swing_end])
+        return *to_world(state.origin, feet), to_world(state.origin, com)[:, :2]
+
+    return jax.tree.map(np.asarray, jax.vmap(of_one)(states))
 
 
 def test_names_units_and_bounds_belong_together():
@@ -69,10 +108,10 @@ def test_every_theta_gives_finite_targets_within_the_limits(bounds, widening):
     share = (rng.uniform(size=(200, 10)) - 0.5) * widening + 0.5
     corners = rng.integers(0, 2, size=(50, 10))
     thetas = jnp.asarray(low + np.concatenate([share, corners]) * (high - low), jnp.float32)
-    times = jnp.asarray(rng.uniform(0.0, 3.0, len(thetas)), jnp.float32)
     measured = jnp.asarray(rng.normal(size=(len(thetas), 3)), jnp.float32)
-    targets = jax.vmap(targets_of)(thetas, times, measured)
-    assert targets.shape == (250, len(JOINT_NAMES))
+    over_time = jax.vmap(targets_of, in_axes=(None, 0, None))
+    targets = jax.vmap(over_time)(thetas, jax.vmap(walk_of)(thetas), measured)
+    assert targets.shape == (250, 61, len(JOINT_NAMES))
     assert jnp.isfinite(targets).all()
     assert (np.asarray(targets) >= np.array(JOINT_LOWER, np.float32)).all()
     assert (np.asarray(targets) <= np.array(JOINT_UPPER, np.float32)).all()
@@ -81,7 +120,9 @@ def test_every_theta_gives_finite_targets_within_the_limits(bounds, widening):
 @given(st.lists(st.floats(-1e20, 1e20), min_size=10, max_size=10), st.floats(-1e6, 1e6))
 @settings(max_examples=30, deadline=None)
 def test_wild_thetas_and_times_give_finite_targets(theta, time):
-    assert jnp.isfinite(targets_of(jnp.array(theta, jnp.float32), jnp.float32(time), LEVEL)).all()
+    theta = jnp.array(theta, jnp.float32)
+    state = jax.tree.map(lambda leaf: leaf[-1], walk_of(theta))
+    assert jnp.isfinite(targets_of(theta, state._replace(time=jnp.float32(time)), LEVEL)).all()
 
 
 def test_params_of_a_sensible_theta_are_the_theta_in_si_units():
@@ -101,64 +142,53 @@ def test_amplitude_and_double_support_are_limited_by_the_duration():
 
 def test_steps_grow_from_standstill_to_the_wanted_length():
     params = params_from_theta(THETA)
-    plan = walk_of(THETA, jnp.array([0.07, 0.0, 0.0]))
-    lengths = np.asarray(plan.com[:, -1, 0] - plan.com[:, 0, 0])
+    support, landing, com = in_world(steps_of(THETA, jnp.array([0.07, 0.0, 0.0])))
+    lengths = com[:, -1, 0] - com[:, 0, 0]
     growth = float(params.step_growth * params.step_duration)
     np.testing.assert_allclose(lengths, np.minimum(growth * np.arange(1, NUM_STEPS + 1), 0.07), atol=1e-6)
     # In the steady walk the body ends each step between the feet.
-    between = 0.5 * (plan.footstep.support + plan.footstep.swing_end)[-1, :2]
-    np.testing.assert_allclose(plan.com[-1, -1], between, atol=1e-6)
-    np.testing.assert_allclose(plan.footstep.swing_end[::2, 1], -FOOT_SPACING / 2, atol=1e-6)
-    np.testing.assert_allclose(plan.footstep.swing_end[1::2, 1], FOOT_SPACING / 2, atol=1e-6)
+    between = 0.5 * (support + landing)[-1, :2]
+    np.testing.assert_allclose(com[-1, -1], between, atol=1e-6)
+    np.testing.assert_allclose(landing[::2, 1], -FOOT_SPACING / 2, atol=1e-6)
+    np.testing.assert_allclose(landing[1::2, 1], FOOT_SPACING / 2, atol=1e-6)
 
 
 @pytest.mark.parametrize(
     "command", [(0.0, 0.03, 0.0), (0.0, -0.03, 0.0), (0.03, 0.0, 0.2), (0.05, 0.02, -0.2)]
 )
 def test_the_engine_walks_in_every_direction(command):
-    plan = walk_of(THETA, jnp.array(command))
-    middles = np.asarray(0.5 * (plan.footstep.support + plan.footstep.swing_end))
-    sideways, turned = middles[-1, 1], middles[-1, 2]
+    steps = steps_of(THETA, jnp.array(command))
+    support, landing, _ = in_world(steps)
+    _, sideways, turned = 0.5 * (support + landing)[-1]
     assert np.sign(np.round(turned, 3)) == np.sign(command[2])
     if command[2] == 0.0:
         assert np.sign(sideways) == np.sign(command[1])
     # Each foot lands on its own side of the other.
-    seen = np.asarray(plan.footstep.swing_end - plan.footstep.support)
-    yaw = np.asarray(plan.footstep.support[:, 2])
+    seen, yaw = landing - support, support[:, 2]
     left = np.cos(yaw) * seen[:, 1] - np.sin(yaw) * seen[:, 0]
-    assert (np.where(plan.footstep.supports_left, -left, left) > 0.09).all()
+    assert (np.where(steps.plan.footstep.supports_left, -left, left) > 0.09).all()
 
 
 def test_turning_mirrors():
-    left, right = walk_of(THETA, jnp.array([0.04, 0.02, 0.2])), walk_of(THETA, jnp.array([0.04, -0.02, -0.2]))
+    ends = []
+    for command in ([0.04, 0.02, 0.2], [0.04, -0.02, -0.2]):
+        support, landing, _ = in_world(steps_of(THETA, jnp.array(command)))
+        ends.append(0.5 * (support + landing)[-1])
     # The first step is always with the same foot, so walks mirror from the second one on, one step apart
     # at most.
-    last_left = np.asarray(0.5 * (left.footstep.support + left.footstep.swing_end))[-1]
-    last_right = np.asarray(0.5 * (right.footstep.support + right.footstep.swing_end))[-1]
-    np.testing.assert_allclose(last_left[2], -last_right[2], atol=0.21)
-
-
-def test_planning_step_by_step_is_planning_at_once():
-    params = params_from_theta(THETA)
-    command = jnp.array([0.05, 0.01, 0.1])
-    at_once, stance = walk_of(THETA, command), standing()
-    step = jax.jit(plan_step)
-    for index in range(NUM_STEPS):
-        plan, stance = step(params, stance, command)
-        for one, all_of_them in zip(jax.tree.leaves(plan), jax.tree.leaves(at_once), strict=True):
-            np.testing.assert_allclose(one, all_of_them[index], atol=1e-6)
+    np.testing.assert_allclose(ends[0][2], -ends[1][2], atol=0.21)
 
 
 def test_com_is_continuous_from_step_to_step_and_starts_between_the_feet():
-    plan = walk_of(THETA, jnp.array([0.07, 0.0, 0.0]))
-    np.testing.assert_allclose(plan.com[1:, 0], plan.com[:-1, -1], atol=1e-6)
-    np.testing.assert_allclose(plan.com[0, 0], 0.0, atol=1e-7)
+    _, _, com = in_world(steps_of(THETA, jnp.array([0.07, 0.0, 0.0])))
+    np.testing.assert_allclose(com[1:, 0], com[:-1, -1], atol=1e-6)
+    np.testing.assert_allclose(com[0, 0], 0.0, atol=1e-7)
 
 
 def test_joint_targets_are_continuous_in_time():
     theta = THETA.at[8].set(0.05)
-    times = jnp.arange(0.0, 2.2, 0.002)
-    targets = np.asarray(jax.vmap(targets_of, in_axes=(None, 0, None))(theta, times, LEVEL))
+    states = jax.jit(lambda: open_loop_walk(straight_walker(theta, period=0.002), ahead(1100)))()
+    targets = np.asarray(jax.vmap(targets_of, in_axes=(None, 0, None))(theta, states, LEVEL))
     # 12 rad/s is twice what the motors do; a jump would be seen as hundreds.
     assert np.abs(np.diff(targets, axis=0)).max() < 0.002 * 30.0
 
@@ -188,7 +218,7 @@ def test_posture_gains_blend_measured_and_intended_lean():
 
 
 def sole_orientation(theta, measured):
-    targets = targets_of(theta, jnp.float32(0.0), measured)
+    targets = targets_of(theta, straight_walker(theta).start(), measured)
     return matrix_to_rpy(leg_fk(targets[LEFT_LEG], LEFT)[:3, :3]), targets
 
 
@@ -226,33 +256,38 @@ def test_legs_that_share_a_motor_keep_their_soles_in_place_at_its_limit():
 
 
 def test_hips_stand_at_the_asked_height_above_the_ankles():
-    targets = targets_of(THETA.at[0].set(0.0), jnp.float32(0.0), LEVEL)
+    theta = THETA.at[0].set(0.0)
+    targets = targets_of(theta, straight_walker(theta).start(), LEVEL)
     T_torso_sole = leg_fk(targets[RIGHT_LEG], RIGHT)
     height = GEOMETRY.hip_z - T_torso_sole[2, 3] - GEOMETRY.ankle_height
     np.testing.assert_allclose(height, 0.176, atol=1e-5)
 
 
 def test_planted_feet_are_not_turned_in_double_support():
-    params = params_from_theta(jnp.array([0.0, 0.17, 0.04, 0.4, 0.0, 0.3, 0.3, 0.05, 0.1, 0.1]))
-    plan = plan_walk(params, NUM_STEPS)
+    theta = THETA.at[8].set(0.25 * DURATION)
+    steps = steps_of(theta)
 
-    def turn_at(steps):
-        return pose_at(params, plan, jnp.float32(steps) * params.step_duration).turn
+    def turn_at(index, phase):
+        state = jax.tree.map(lambda leaf: leaf[index], steps)
+        return straight_walker(theta).pose(at_phase(state, phase)).turn
 
     # A quarter of the step has both feet on the ground, half of it at each end.
-    np.testing.assert_allclose(turn_at(2.12), turn_at(1.88), atol=1e-6)
-    assert abs(turn_at(2.12)) == pytest.approx(0.5)
-    assert abs(turn_at(2.5)) < 1e-5
+    np.testing.assert_allclose(turn_at(2, 0.12), turn_at(1, 0.88), atol=1e-6)
+    assert abs(turn_at(2, 0.12)) == pytest.approx(0.5)
+    assert abs(turn_at(2, 0.5)) < 1e-5
+
+
+def first_step(theta):
+    return jax.tree.map(lambda leaf: leaf[0], steps_of(theta, num=1))
 
 
 def test_heading_hold_turns_the_feet_back_and_is_off_by_default():
-    params = params_from_theta(THETA)
-    plan = plan_walk(params, NUM_STEPS)
     turned_left = jnp.array([0.0, 0.0, 0.2])
-    time = 0.95 * params.step_duration  # the right foot is about to land
+    # The right foot is about to land.
+    pose = straight_walker(THETA).pose(at_phase(first_step(THETA), 0.95))
 
     def right_foot_yaw(balance):
-        targets = joint_targets(params, plan, time, turned_left, balance=balance)
+        targets = pose_joints(params_from_theta(THETA), pose, turned_left, balance=balance)
         return matrix_to_rpy(leg_fk(targets[RIGHT_LEG], RIGHT)[:3, :3])[2]
 
     np.testing.assert_allclose(right_foot_yaw(Balance()), 0.0, atol=1e-5)
@@ -261,15 +296,14 @@ def test_heading_hold_turns_the_feet_back_and_is_off_by_default():
 
 def test_a_landing_foot_is_put_out_to_where_the_robot_tips_and_that_is_off_by_default():
     # Without roll gain the feet stay level, and the tilt alone changes nothing about where they are put.
-    params = params_from_theta(THETA.at[6].set(0.0))
-    plan = plan_walk(params, NUM_STEPS)
+    theta = THETA.at[6].set(0.0)
+    step = first_step(theta)
 
     def sideways(phase, roll, **balance):
         """Return how far to the left of the hips the left and the right sole are, in a level frame."""
         measured = jnp.array([roll, 0.0, 0.0])
-        targets = joint_targets(
-            params, plan, phase * params.step_duration, measured, balance=Balance(**balance)
-        )
+        pose = straight_walker(theta).pose(at_phase(step, phase))
+        targets = pose_joints(params_from_theta(theta), pose, measured, balance=Balance(**balance))
         soles = [
             rotation_x(roll) @ (leg_fk(targets[leg], side)[:3, 3] - jnp.array([0.0, 0.0, GEOMETRY.hip_z]))
             for leg, side in ((LEFT_LEG, LEFT), (RIGHT_LEG, RIGHT))
@@ -284,11 +318,9 @@ def test_a_landing_foot_is_put_out_to_where_the_robot_tips_and_that_is_off_by_de
         np.testing.assert_allclose(moved, -0.5 * 0.176 * 0.1 * np.array(expected), atol=3e-4)
 
 
-def test_the_plan_holds_its_last_pose_after_its_end():
-    params = params_from_theta(THETA)
-    plan = plan_walk(params, 3)
-    late = pose_at(params, plan, 10.0 * params.step_duration)
-    end = pose_at(params, plan, 3.0 * params.step_duration)
+def test_a_step_holds_its_last_pose_after_its_end():
+    step, walker = first_step(THETA), straight_walker(THETA)
+    late, end = walker.pose(at_phase(step, 10.0)), walker.pose(at_phase(step, 1.0))
     for a, b in zip(late, end, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
