@@ -4,6 +4,7 @@ All have the joints of the simulated NAO, in the order and with the signs and fr
 """
 
 import dataclasses
+from collections.abc import Mapping
 from math import radians
 
 from creps_jax.robots.nao_geometry import (
@@ -17,7 +18,7 @@ from creps_jax.robots.nao_geometry import (
     NaoGeometry,
 )
 
-__all__ = ["NAO", "NAO_H25", "Robot"]
+__all__ = ["NAO", "NAO_H25", "ROBOTS", "Robot"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,3 +180,6 @@ NAO_H25 = Robot(
 
 One motor drives the yaw-pitch of both hips; the joint of each leg has half of its torque.
 """
+
+ROBOTS: Mapping[str, Robot] = {robot.name: robot for robot in (NAO, NAO_H25)}
+"""The robots by name."""

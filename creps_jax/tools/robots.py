@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from creps_jax.errors import UserError, suggest
+from creps_jax.robots import robot as robots
 from creps_jax.robots.robot import NAO, NAO_H25, Robot
 from creps_jax.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS
 
@@ -26,9 +27,9 @@ class RobotRanges(NamedTuple):
     bounds: Bounds
 
 
+_RANGES = {NAO.name: (0.1, 0.6, NAO_BOUNDS), NAO_H25.name: (0.05, 0.3, NAO_H25_BOUNDS)}
 ROBOTS: Mapping[str, RobotRanges] = {
-    ranges.robot.name: ranges
-    for ranges in (RobotRanges(NAO, 0.1, 0.6, NAO_BOUNDS), RobotRanges(NAO_H25, 0.05, 0.3, NAO_H25_BOUNDS))
+    name: RobotRanges(robot, *_RANGES[name]) for name, robot in robots.ROBOTS.items()
 }
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from creps_jax import checks
 from creps_jax.policies.learned import Learned
-from creps_jax.robots.robot import NAO, NAO_H25
+from creps_jax.robots.robot import NAO, ROBOTS
 from creps_jax.typing import Array, Float
 from creps_jax.walking.controller import Gait, Walker
 from creps_jax.walking.params import PARAM_NAMES, params_from_theta
@@ -34,7 +34,6 @@ AHEAD = (1.0, 0.0, 0.0)
 LARGEST_SIDE, LARGEST_TURN = 0.2, 1.0
 # Acceleration of a command that is followed at once.
 _AT_ONCE = (1e6, 1e6, 1e6)
-_ROBOTS = {robot.name: robot for robot in (NAO, NAO_H25)}
 
 
 @checks.arguments
@@ -102,11 +101,11 @@ def learned_walker(learned: Learned, **settings: Any) -> Walker:
         expected = f"speed, or {', '.join(COMMAND_NAMES)}"
         raise ValueError(f"learned must be a walk whose contexts are {expected}, got {', '.join(names)}")
     robot = task.get("robot", NAO.name)
-    if robot not in _ROBOTS:
-        raise ValueError(f"the robot of learned must be one of {', '.join(_ROBOTS)}, got {robot!r}")
+    if robot not in ROBOTS:
+        raise ValueError(f"the robot of learned must be one of {', '.join(ROBOTS)}, got {robot!r}")
     gait = _command_gait(learned) if names == COMMAND_NAMES else _speed_gait(learned)
     defaults = {
-        "robot": _ROBOTS[robot],
+        "robot": ROBOTS[robot],
         "balance": Balance(**task.get("balance", {})),
         "com": task.get("com", "one_step"),
     }
