@@ -671,6 +671,11 @@ ROWS = {
         partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))
     ),
     "Learned()": row(lambda values: list(LEARNED(values).values()), values=number(0.3)),
+    "Space.unbounded": made(
+        cj.Space.unbounded,
+        names=Argument(("a", "b"), one_of((None, "None"), (3, "3"), ((), "()"), (("a", "a"), "'a', 'a'"))),
+        units=Argument(("m", "rad"), one_of((("m",), "'m'"), ((1.0, 2.0), "1.0"))),
+    ),
     "Space.contains": row(SPEED.contains, values=vector((0.3,))),
     "load": row(cj.load, use=lambda learned: learned.policy, path=Argument(FOLDER / "policy.npz", NO_PATH)),
     "save": row(

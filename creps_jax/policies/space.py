@@ -69,6 +69,20 @@ class Space:
         if self.constraint == SIGMOID and not all(abs(end) <= checks.FLOAT32_MAX for end in (*low, *high)):
             raise ValueError(f"low and high must be finite in float32 for a sigmoid, got {low} and {high}")
 
+    @classmethod
+    def unbounded(cls, names: tuple[str, ...], units: tuple[str, ...] = ()) -> "Space":
+        """Return the space of variables that may be any number.
+
+        Args:
+            names: A name for each of the variables.
+            units: Units, by default none.
+
+        Raises:
+            ValueError: As for other spaces.
+        """
+        num = len(names) if isinstance(names, tuple | list) else 1
+        return cls(names, (-math.inf,) * num, (math.inf,) * num, units)
+
     @property
     def size(self) -> int:
         """The number of variables."""

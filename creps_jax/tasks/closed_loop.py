@@ -137,6 +137,18 @@ def make_setup(
     return WalkSetup(robot, duration, noise, conditions, world_of(used), used.nv, control_step)
 
 
+def check_start_up(start_up: float, duration: float) -> None:
+    """Check that the start-up of an episode ends before the episode.
+
+    Raises:
+        ValueError: If it does not.
+    """
+    if not 0 <= start_up < duration:
+        raise ValueError(
+            f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
+        )
+
+
 def check_numbers(name: str, record: Any, *, least: float = -math.inf) -> None:
     """Check that each field of a record is a number in its limits.
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from creps_jax import checks
+from creps_jax.policies.space import Space
 from creps_jax.simulation.world import World
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
@@ -145,6 +146,16 @@ def push(low: float, high: float, *, time: float = 3.0) -> Condition:
         return circumstances._replace(push=value, push_time=time)
 
     return _checked(Condition("push", "m/s", low, high, apply, begins=time))
+
+
+def with_conditions(space: Space, conditions: Sequence[Condition]) -> Space:
+    """Return the space of contexts that hold the variables of a space and then the conditions."""
+    return Space(
+        (*space.names, *(c.name for c in conditions)),
+        (*space.low, *(c.low for c in conditions)),
+        (*space.high, *(c.high for c in conditions)),
+        (*space.units, *(c.unit for c in conditions)),
+    )
 
 
 def check_conditions(conditions: Sequence[Condition], duration: float, period: float) -> None:

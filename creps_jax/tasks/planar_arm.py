@@ -220,8 +220,7 @@ def _dmp_parameters(*, num_goals: int) -> Space:
     """Name the weights of each basis and joint, and the goals of the first joints."""
     weights = [f"weight_{basis + 1}_{joint + 1}" for basis in range(NUM_BASIS) for joint in range(NUM_LINKS)]
     names = (*weights, *(f"goal_{joint + 1}" for joint in range(num_goals)))
-    free = (math.inf,) * len(names)
-    return Space(names, tuple(-end for end in free), free, ("rad",) * len(names))
+    return Space.unbounded(names, ("rad",) * len(names))
 
 
 def _movement(weights: Array, goal: Array) -> DmpTrajectory:

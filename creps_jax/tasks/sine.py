@@ -47,5 +47,5 @@ def sinus(low: float = 0.0, high: float = 5 * math.pi) -> Task:
         theta_dim=1,
         worst_reward=-100.0,
         contexts=Space(("angle",), (low,), (high,), ("rad",)),
-        parameters=Space(("sine",), (-math.inf,), (math.inf,)),
+        parameters=Space.unbounded(("sine",)),
     )

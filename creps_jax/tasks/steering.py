@@ -1,6 +1,5 @@
 """The steered walk: a simulated robot walks at a commanded (vx, vy, turn rate)."""
 
-import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -26,11 +25,12 @@ from creps_jax.tasks.closed_loop import (
     advance,
     begin,
     check_numbers,
+    check_start_up,
     is_fallen,
     make_setup,
     without_fallen,
 )
-from creps_jax.tasks.conditions import Condition
+from creps_jax.tasks.conditions import Condition, with_conditions
 from creps_jax.typing import Array, Bool, Float, Int, IntScalar, PRNGKey, Scalar, VectorLike
 from creps_jax.walking.controller import COM_METHODS, Gait, Walker
 from creps_jax.walking.gaits import COMMAND_NAMES, COMMAND_UNITS, steered_gait
@@ -146,21 +146,13 @@ def nao_steered_walk(
     if lows.size != len(COMMAND_NAMES):
         raise ValueError(f"low must have three entries, {', '.join(COMMAND_NAMES)}, got {checks.shown(low)}")
     check_numbers("reward", reward, least=0.0)
-    if not 0 <= start_up < duration:
-        raise ValueError(
-            f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
-        )
+    check_start_up(start_up, duration)
     parts = _checked_profile(profile, start_up, duration)
     check_numbers("balance", balance)
     setup = make_setup(robot, model, duration, noise, conditions, physics)
-    contexts = Space(
-        (*COMMAND_NAMES, *(c.name for c in conditions)),
-        (*lows.tolist(), *(c.low for c in conditions)),
-        (*highs.tolist(), *(c.high for c in conditions)),
-        (*COMMAND_UNITS, *(c.unit for c in conditions)),
-    )
-    free = (math.inf,) * len(STEERED_PARAM_NAMES)
-    parameters = Space(STEERED_PARAM_NAMES, tuple(-end for end in free), free, STEERED_PARAM_UNITS)
+    commands = Space(COMMAND_NAMES, tuple(lows.tolist()), tuple(highs.tolist()), COMMAND_UNITS)
+    contexts = with_conditions(commands, conditions)
+    parameters = Space.unbounded(STEERED_PARAM_NAMES, STEERED_PARAM_UNITS)
     if sample_context is None:
         sample_context = ellipsoid_contexts(contexts.low, contexts.high)
 

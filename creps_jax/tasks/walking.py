@@ -1,6 +1,5 @@
 """The walking task: a simulated robot walks straight ahead from standstill, at a commanded speed."""
 
-import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -25,11 +24,12 @@ from creps_jax.tasks.closed_loop import (
     advance,
     begin,
     check_numbers,
+    check_start_up,
     is_fallen,
     make_setup,
     without_fallen,
 )
-from creps_jax.tasks.conditions import Condition
+from creps_jax.tasks.conditions import Condition, with_conditions
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar
 from creps_jax.walking.controller import Walker
 from creps_jax.walking.engine import BodyPose
@@ -156,21 +156,18 @@ def nao_walk(
     """
     checks.ends(low, high)
     check_numbers("reward", reward)
-    if not 0 <= start_up < duration:
-        raise ValueError(
-            f"start_up must lie in [0, duration), got start_up {start_up} and duration {duration}"
-        )
+    check_start_up(start_up, duration)
     check_numbers("balance", balance)
     setup = make_setup(robot, model, duration, noise, conditions, physics)
+    contexts = with_conditions(Space(("speed",), (low,), (high,), ("m/s",)), conditions)
+    parameters = Space.unbounded(PARAM_NAMES, PARAM_UNITS)
     if sample_context is None:
-        lows, highs = [low, *(c.low for c in conditions)], [high, *(c.high for c in conditions)]
-        sample_context = gaussian_contexts(lows, highs, clip=True)
+        sample_context = gaussian_contexts(contexts.low, contexts.high, clip=True)
     start_up_ticks = round(start_up / CONTROL_PERIOD)
-    context_dim = 1 + len(conditions)
 
     @checks.arguments
     def rollout(key: PRNGKey, context: Array, theta: Float[Array, "10"]) -> WalkOutcome:
-        context = checks.array("context", context, (context_dim,))
+        context = checks.array("context", context, (contexts.size,))
         walker = straight_walker(theta, robot=robot, period=CONTROL_PERIOD, balance=balance)
         walk, start = begin(setup, walker, key, context[1:])
         end = _walk_to_end(setup, walker, walk, start, start_up_ticks)
@@ -178,14 +175,6 @@ def nao_walk(
 
     # A fall at twice the highest speed in the wrong direction.
     worst = -(reward.fall + reward.speed * (3.0 * high) ** 2)
-    contexts = Space(
-        ("speed", *(c.name for c in conditions)),
-        (low, *(c.low for c in conditions)),
-        (high, *(c.high for c in conditions)),
-        ("m/s", *(c.unit for c in conditions)),
-    )
-    free = (math.inf,) * len(PARAM_NAMES)
-    parameters = Space(PARAM_NAMES, tuple(-end for end in free), free, PARAM_UNITS)
     return Task(sample_context, rollout, contexts.size, parameters.size, worst, contexts, parameters)
 
 

@@ -54,6 +54,15 @@ def test_a_search_can_begin_at_known_parameters(constraint):
         space.free(jnp.zeros(2))
 
 
+def test_an_unbounded_space_takes_any_finite_number():
+    space = Space.unbounded(("length", "angle"), ("m", "rad"))
+    assert (space.names, space.units) == (("length", "angle"), ("m", "rad"))
+    assert space.contains((-1e30, 1e30)) and not space.contains((np.inf, 0.0))
+    free = jnp.asarray([-1e30, 3.0])
+    np.testing.assert_array_equal(space.inside(free), free)
+    assert Space.unbounded(("length",)).units == ("",)
+
+
 def test_equal_bounds_fix_a_parameter():
     low, high = (0.0, 3.0), (1.0, 3.0)
     np.testing.assert_array_equal(sigmoid_gate(jnp.asarray([0.0, 7.0]), low, high), [0.5, 3.0])
