@@ -41,7 +41,8 @@ import creps_jax as cj
 from creps_jax.robots.nao_geometry import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER
 from creps_jax.tools.plots import COLOURS
 from creps_jax.walking.com import zmp_of_com
-from creps_jax.walking.engine import NUM_NODES, com_heights, pose_joints
+from creps_jax.walking.com_plan import NUM_NODES, com_heights
+from creps_jax.walking.engine import pose_joints
 from creps_jax.walking.gaits import AHEAD, straight_walker
 from creps_jax.walking.open_loop import open_loop_walk
 from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS, params_from_theta

@@ -42,6 +42,7 @@ from creps_jax.tasks.steering import SteeringReward, record_drive
 from creps_jax.tasks.walking import WalkNoise, WalkReward, record_walk
 from creps_jax.walking import (
     com,
+    com_plan,
     engine,
     footsteps,
     gaits,
@@ -469,9 +470,9 @@ MOTION = {
         commands=array(np.ones((2, 3)), free=(0,), bears=ANY),
     ),
     "params_from_theta": traced(params.params_from_theta, theta=array(np.ones(10), bears=ANY)),
-    "plan_com": traced(engine.plan_com, params=record(WALK), start=PLANAR, support=PLANAR, end=PLANAR),
+    "plan_com": traced(com_plan.plan_com, params=record(WALK), start=PLANAR, support=PLANAR, end=PLANAR),
     "plan_continuous_com": traced(
-        engine.plan_continuous_com,
+        com_plan.plan_continuous_com,
         params=record(WALK),
         before=array(np.ones((2, 2)), bears=ANY),
         start=PLANAR,

@@ -16,17 +16,8 @@ from creps_jax import checks
 from creps_jax.numerics.rotations import wrapped
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.typing import Array, Bool, Float, IntScalar, Scalar, ScalarLike
-from creps_jax.walking.engine import (
-    NUM_NODES,
-    BodyPose,
-    ComPlan,
-    StepPlan,
-    body_pose,
-    plan_com,
-    plan_continuous_com,
-    pose_joints,
-    stand_upright,
-)
+from creps_jax.walking.com_plan import NUM_NODES, ComPlan, plan_com, plan_continuous_com
+from creps_jax.walking.engine import BodyPose, StepPlan, body_pose, pose_joints, stand_upright
 from creps_jax.walking.footsteps import Footstep, Stance, compose, next_footstep, relative_pose, standing
 from creps_jax.walking.params import WalkParams
 from creps_jax.walking.posture import Balance, Tilt, next_tilt

@@ -10,8 +10,9 @@ import pytest
 from jax import lax
 
 from creps_jax.walking.com import com_velocities
+from creps_jax.walking.com_plan import com_heights, plan_com
 from creps_jax.walking.controller import Gait, Stage, Walker
-from creps_jax.walking.engine import StepPlan, body_pose, com_heights, plan_com
+from creps_jax.walking.engine import StepPlan, body_pose
 from creps_jax.walking.footsteps import next_footstep, relative_pose, standing
 from creps_jax.walking.gaits import AHEAD, limited_command, straight_walker
 from creps_jax.walking.params import params_from_theta

@@ -17,7 +17,7 @@ from creps_jax.robots.nao_geometry import LEFT, RIGHT, leg_indices
 from creps_jax.robots.nao_kinematics import leg_links, leg_reach
 from creps_jax.tools.export.c_header import floats, identifier, number
 from creps_jax.tools.export.formula import formula_of
-from creps_jax.walking import controller, engine, footsteps, gaits, params, posture
+from creps_jax.walking import com_plan, controller, engine, footsteps, gaits, params, posture
 from creps_jax.walking.controller import Walker
 from creps_jax.walking.gaits import COMMAND_NAMES, learned_walker
 
@@ -59,7 +59,7 @@ def make_walk(policy: Learned, name: str = "walk", *, period: float = 0.02) -> t
         "HEADER": f"{name}.h",
         "PERIOD": number(np.float32(period)),
         "NUM_JOINTS": str(len(robot.joint_lower)),
-        "NUM_NODES": str(engine.NUM_NODES),
+        "NUM_NODES": str(com_plan.NUM_NODES),
         "RANGES": "\n".join(
             f"#define WALK_{axis.upper()}_{end} {number(value)}"
             for axis, low, high in ranges
@@ -145,7 +145,7 @@ def _constants(policy: Learned, walker: Walker) -> list[str]:
         "OUT_SIGN": robot.own_signs,
     }
     if walker.com == "continuous":
-        vectors["LARGEST_SHIFT"] = engine.LARGEST_SHIFT
+        vectors["LARGEST_SHIFT"] = com_plan.LARGEST_SHIFT
     flags = {
         "ONE_YAW_MOTOR": robot.has_one_yaw_motor,
         "IS_ONE_STEP": walker.com == "one_step",
