@@ -389,6 +389,7 @@ INNER = {
     "compose",
     "continuous_com_trajectory",
     "filter_memory",
+    "vertical_trunk",
     "limited_command",
     "next_tilt",
     "relative_pose",

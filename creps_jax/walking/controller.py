@@ -17,7 +17,14 @@ from creps_jax.numerics.rotations import wrapped
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.typing import Array, Bool, Float, IntScalar, Scalar, ScalarLike
 from creps_jax.walking.com_plan import NUM_NODES, ComPlan, plan_com, plan_continuous_com
-from creps_jax.walking.engine import BodyPose, StepPlan, body_pose, pose_joints, stand_upright
+from creps_jax.walking.engine import (
+    BodyPose,
+    StepPlan,
+    body_pose,
+    pose_joints,
+    stand_upright,
+    vertical_trunk,
+)
 from creps_jax.walking.footsteps import Footstep, Stance, compose, next_footstep, relative_pose, standing
 from creps_jax.walking.params import WalkParams
 from creps_jax.walking.posture import Balance, Tilt, next_tilt
@@ -207,7 +214,7 @@ class Walker:
         params = params._replace(swing_height=jnp.where(is_stepping, params.swing_height, 0.0))
         pose = body_pose(params, state.plan, state.time / params.step_duration, robot=self.robot)
         pose = pose._replace(turn=jnp.where(is_stepping, pose.turn, 0.0))
-        return stand_upright(pose, jnp.asarray(slope, pose.hips.dtype))
+        return stand_upright(pose, jnp.asarray(slope, pose.hips.dtype), state.origin[2])
 
     def _advanced_time(self, state: WalkerState, command: Array) -> tuple[Scalar, Bool[Array, ""]]:
         """Return the time within the step one period later, and whether another step begins."""
@@ -221,9 +228,11 @@ class Walker:
     def _joints(self, state: WalkerState, measured_yaw: Scalar, slope: ScalarLike) -> Float[Array, "22"]:
         """Return the joint targets of a state, for its tilt and the measured yaw of the trunk."""
         orientation = jnp.append(state.tilt.angle, wrapped(measured_yaw - state.origin[2]))
-        params, pose = state.gait.params, self._pose_in_step(state, slope)
-        params = params._replace(lean=params.lean + slope)
-        return pose_joints(params, pose, orientation, balance=self.balance, robot=self.robot)
+        pose = self._pose_in_step(state, slope)
+        vertical = vertical_trunk(slope, state.origin[2] + pose.hips[3])
+        return pose_joints(
+            state.gait.params, pose, orientation, vertical=vertical, balance=self.balance, robot=self.robot
+        )
 
     def _begin_step(self, state: WalkerState, command: Array, measured_yaw: Scalar) -> WalkerState:
         """Plan the next step, in the frame of the body at its start."""

@@ -11,7 +11,7 @@ from creps_jax.numerics.rotations import rigid_transform, rotation_x, rotation_y
 from creps_jax.robots.nao_geometry import LEFT, RIGHT, leg_indices
 from creps_jax.robots.nao_kinematics import leg_ik
 from creps_jax.robots.robot import NAO, Robot
-from creps_jax.typing import Array, Float, Scalar
+from creps_jax.typing import Array, Float, Scalar, ScalarLike
 from creps_jax.walking.com import spring_height
 from creps_jax.walking.footsteps import Footstep
 from creps_jax.walking.params import WalkParams
@@ -24,6 +24,7 @@ __all__ = [
     "body_pose",
     "pose_joints",
     "stand_upright",
+    "vertical_trunk",
 ]
 
 # Swing of the shoulders against the legs, rad for each metre that the other foot is ahead, and the arms'
@@ -111,18 +112,30 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar, *, robot: Robot
 
 
 @checks.arguments
-def stand_upright(pose: BodyPose, slope: Scalar) -> BodyPose:
+def stand_upright(pose: BodyPose, slope: Scalar, yaw: ScalarLike = 0.0) -> BodyPose:
     """Move the hips of a pose to where they stand above the feet as gravity has it.
 
     Args:
-        pose: A pose planned for level ground, in the frame of the floor.
-        slope: Angle by which the floor rises along x, rad.
+        pose: A pose planned for level ground, in a frame on the floor.
+        slope: Angle by which the floor rises uphill, rad.
+        yaw: Angle from uphill to the x axis of the frame, rad.
 
     Returns:
-        The pose with the hips farther ahead, by what their height makes of the slope.
+        The pose with the hips farther uphill, by the tangent of the slope times their height.
     """
-    ahead = pose.hips[2] * jnp.tan(slope)
-    return pose._replace(hips=pose.hips.at[0].add(ahead))
+    uphill = jnp.stack([jnp.cos(yaw), -jnp.sin(yaw)])
+    return pose._replace(hips=pose.hips.at[:2].add(pose.hips[2] * jnp.tan(slope) * uphill))
+
+
+def vertical_trunk(slope: ScalarLike, yaw: Scalar) -> Float[Array, "2"]:
+    """Return roll and pitch of a vertical trunk, seen from a floor that rises by `slope`, rad.
+
+    Args:
+        slope: Angle by which the floor rises uphill, rad.
+        yaw: Heading of the trunk, from uphill, rad.
+    """
+    roll = jnp.arcsin(jnp.sin(slope) * jnp.sin(yaw))
+    return jnp.stack([roll, jnp.arctan2(jnp.sin(slope) * jnp.cos(yaw), jnp.cos(slope))])
 
 
 def _above_floor(foot, height, back):
@@ -137,6 +150,7 @@ def pose_joints(
     pose: BodyPose,
     measured_rpy: Float[Array, "3"],
     *,
+    vertical: Float[Array, "2"] | None = None,
     balance: Balance = Balance(),
     robot: Robot = NAO,
 ) -> Float[Array, "22"]:
@@ -147,6 +161,7 @@ def pose_joints(
         pose: Where hips and feet shall be.
         measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw relative to the planned
             heading's origin.
+        vertical: Roll and pitch of a vertical trunk, rad; zero by default, see `vertical_trunk`.
         balance: How steps answer to the measured orientation.
         robot: Who walks.
 
@@ -157,13 +172,14 @@ def pose_joints(
         ValueError: If the measured orientation is not finite.
     """
     checks.finite("measured_rpy", measured_rpy)
-    intended = jnp.stack([jnp.zeros_like(params.lean), params.lean])
+    vertical = jnp.zeros(2, params.lean.dtype) if vertical is None else vertical
+    intended = vertical.at[1].add(params.lean)
     roll, pitch = corrected_lean(intended, measured_rpy[:2], params.roll_gain, params.tilt_gain)
     R_level_trunk = rotation_y(pitch) @ rotation_x(roll)
     heading_error = jnp.clip(wrapped(pose.hips[3] - measured_rpy[2]), -1.0, 1.0)
     heading_step = balance.heading_gain * heading_error
     turn = jnp.clip(heading_step, -MAX_HEADING_STEP, MAX_HEADING_STEP) * pose.turn
-    tilt = jnp.clip(measured_rpy[0], -MAX_TILT, MAX_TILT)
+    tilt = jnp.clip(measured_rpy[0] - vertical[0], -MAX_TILT, MAX_TILT)
     aside = -balance.placement_gain * params.hip_height * tilt
     aside_left, aside_right = aside * (0.5 + pose.turn), aside * (0.5 - pose.turn)
     place = partial(_sole_in_torso, pose.hips, R_level_trunk=R_level_trunk, geometry=robot.geometry)

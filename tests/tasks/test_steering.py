@@ -5,11 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from creps_jax.files import policies_folder
+from creps_jax.policies.learned import load
 from creps_jax.simulation import c
 from creps_jax.tasks.closed_loop import WalkNoise
+from creps_jax.tasks.conditions import slope
 from creps_jax.tasks.steering import moved, nao_steered_walk, record_drive
 from creps_jax.walking.controller import Stage, Walker
-from creps_jax.walking.gaits import steered_gait
+from creps_jax.walking.gaits import learned_walker, steered_gait
 from creps_jax.walking.params import NAO_STEERED_BOUNDS, STEERED_PARAM_NAMES
 from creps_jax.walking.posture import Balance
 
@@ -93,6 +96,21 @@ def test_a_robot_is_driven_stops_and_stands():
     assert drive.stage[-1] == Stage.STANDING
     np.testing.assert_allclose(np.asarray(drive.speed[250:]).mean(axis=0), 0.0, atol=0.02)
     assert np.asarray(drive.speed[60:110]).mean(axis=0)[0] > 0.1
+
+
+def test_a_robot_walks_a_circle_on_a_slope():
+    """Uphill lies ahead, to the left, behind and to the right in turn: the robot stands upright in each."""
+    walker = learned_walker(load(policies_folder() / "steer.npz"))
+    commands = jnp.tile(jnp.array([0.2, 0.0, 0.5]), (700, 1))
+
+    def drive(key):
+        settings = {"conditions": (slope(-10.0, 10.0),), "values": jnp.array([8.0])}
+        return record_drive(key, walker, commands, physics=c.make_control_step, **settings)
+
+    drives = jax.jit(jax.vmap(drive))(jax.random.split(jax.random.key(0), 4))
+    assert not drives.has_fallen.any()
+    turned = np.sum(np.asarray(drives.speed[:, :, 2]), axis=1) * 0.02
+    assert (turned > np.radians(270.0)).all()
 
 
 def test_a_walker_of_another_period_cannot_be_simulated():

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from creps_jax.numerics.rotations import matrix_to_rpy, rotation_x
+from creps_jax.numerics.rotations import matrix_to_rpy, rotation_x, rotation_y, rotation_z
 from creps_jax.robots.nao_geometry import (
     GEOMETRY,
     JOINT_LOWER,
@@ -23,7 +23,7 @@ from creps_jax.robots.nao_geometry import (
 from creps_jax.robots.nao_kinematics import leg_fk
 from creps_jax.robots.robot import NAO_H25
 from creps_jax.walking.controller import Gait
-from creps_jax.walking.engine import BodyPose, pose_joints
+from creps_jax.walking.engine import BodyPose, pose_joints, stand_upright, vertical_trunk
 from creps_jax.walking.footsteps import FOOT_SPACING, compose, next_footstep, standing
 from creps_jax.walking.gaits import AHEAD, straight_walker
 from creps_jax.walking.open_loop import open_loop_walk
@@ -332,3 +332,17 @@ def test_a_landing_beyond_reach_is_held_at_it():
     assert abs(float(seen[0])) <= 0.2 + 1e-6
     assert abs(float(seen[1])) <= 0.18 + 1e-6
     assert abs(float(seen[2])) <= 0.6 + 1e-6
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, -2.0, 3.0])
+def test_a_trunk_is_vertical_on_a_slope_whatever_its_heading(yaw):
+    slope = 0.3
+    up = np.array([np.sin(slope), 0.0, np.cos(slope)])
+    roll, pitch = vertical_trunk(slope, jnp.float32(yaw))
+    trunk = rotation_z(jnp.float32(yaw)) @ rotation_y(pitch) @ rotation_x(roll)
+    np.testing.assert_allclose(trunk[:, 2], up, atol=1e-6)
+    # Hips on a line against gravity above the feet, in a frame with this heading.
+    zero = jnp.zeros(4)
+    pose = stand_upright(BodyPose(zero.at[2].set(0.2), zero, zero, jnp.float32(0.0)), jnp.float32(slope), yaw)
+    hips = rotation_z(jnp.float32(yaw)) @ pose.hips[:3]
+    np.testing.assert_allclose(hips / np.linalg.norm(hips), up, atol=1e-6)
