@@ -25,7 +25,7 @@ from creps_jax.search.creps import Creps, creps
 from creps_jax.search.fit import fit_within
 from creps_jax.tasks import Task, average_repeats, sigmoid_constrained
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD, WalkNoise
-from creps_jax.tasks.steering import SteeringReward, nao_steered_walk, record_drive
+from creps_jax.tasks.steering import Drive, SteeringReward, nao_steered_walk, record_drive
 from creps_jax.tools import plots
 from creps_jax.tools.play import POLICY, load_walking_policy
 from creps_jax.training import evaluate
@@ -72,7 +72,12 @@ class Settings:
         start_std: standard deviation of the first policy, before squashing.
         start_policy: policy file of this experiment to continue, instead of a first policy from scratch; with
             its own deviations.
-        learning_noise: factor of the usual noise in learning.
+        learning_noise: factor of the usual noise in learning: so large that many samples fall. Where falls
+            are rare, rewards differ in the speeds only, and the search does not learn to stay up.
+        candidates: number of policies, from equally spaced iterations of the second half of learning; kept is
+            the one that stays up longest in drives by random commands in the noise of learning.
+        candidate_drives: number of drives of each candidate.
+        candidate_seconds: length of a drive of a candidate, s.
         learning_duration: length of an episode in learning, s.
         duration: length of an episode of the evaluation, s.
         heading_gain: share of the heading error that a step turns back; a robot that is steered needs
@@ -89,7 +94,7 @@ class Settings:
         physics: simulator: auto, mjx or c.
     """
 
-    iterations: int = 140
+    iterations: int = 240
     samples: int = 60
     first_samples: int = 240
     repeats: int = 1
@@ -101,13 +106,16 @@ class Settings:
     degree: int = 2
     start_std: float = 0.7
     start_policy: str | None = None
-    learning_noise: float = 1.6
+    learning_noise: float = 2.8
+    candidates: int = 8
+    candidate_drives: int = 40
+    candidate_seconds: float = 30.0
     learning_duration: float = 6.4
     duration: float = 8.0
     heading_gain: float = 0.0
     placement_gain: float = 0.6
     filter_time: float = 0.06
-    acceleration: tuple[float, float, float] = (0.6, 0.1, 0.5)
+    acceleration: tuple[float, float, float] = (0.7, 0.08, 0.4)
     learning_acceleration: tuple[float, float, float] = (0.6, 0.4, 2.0)
     com: str = "continuous"
     eval_seeds: int = 10
@@ -258,7 +266,7 @@ def stops(num: int) -> np.ndarray:
 
 def drive_all(
     settings: Settings, walker: Walker, key: jax.Array, commands: np.ndarray, *, noise: float = 1.0
-) -> Any:
+) -> Drive:
     """Drive a robot by each of the commands (n, ticks, 3); return the records (n, ticks, ...)."""
     physics = PHYSICS[settings.physics]
 
@@ -267,18 +275,19 @@ def drive_all(
         return record._replace(qpos=record.qpos[:, :7], set_point=record.set_point[:, :0])
 
     keys = jax.random.split(key, len(commands))
-    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(keys, jnp.asarray(commands)))
+    return jax.jit(jax.vmap(one))(keys, jnp.asarray(commands))
 
 
 def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dict[str, np.ndarray]:
     """Learn, then evaluate the mean policy at a grid of commands, by random commands and by stops.
 
     Returns:
-        Arrays of the learning (1, iterations), the policy, `commands` (n, 3) of the evaluation with `speed`
+        Arrays of the learning (1, iterations), the share of time that the `candidates` (iterations) were up
+        and which one was `kept`, the kept policy, `commands` (n, 3) of the evaluation with `speed`
         (n, seeds, 3) and `fell` (n, seeds). The parts `drive` and `noisy_drive` say whether drives by random
         commands fell, `stop` whether stops fell and the time until the robot stood.
     """
-    evaluate_key, learn_key, drive_key, noisy_key, stop_key = jax.random.split(key, 5)
+    evaluate_key, learn_key, drive_key, noisy_key, stop_key, keep_key = jax.random.split(key, 6)
     task = make_task(
         settings,
         noise=settings.learning_noise,
@@ -299,14 +308,46 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         session=session,
         name="steer",
     )
-    policy = jax.tree.map(lambda leaf: leaf[0], states.policy)
+    policies = jax.tree.map(lambda leaf: leaf[0], states.policy)._replace(coef=log["coef"][0])
+    kept, upright = keep_steadiest(settings, keep_key, policies)
+    policy = policies._replace(coef=jnp.asarray(policies.coef[kept]))
     return {
+        "candidates": np.array(list(upright)),
+        "candidate_upright": np.array(list(upright.values())),
+        "kept": np.array(kept),
         "episodes": plan.episodes(np.arange(1, log["mean_reward"].shape[1] + 1)),
         "coef": np.asarray(policy.coef),
         "cov_chol": np.asarray(policy.cov_chol),
         **named("log", log),
         **evaluate_policy(settings, policy, (evaluate_key, drive_key, noisy_key, stop_key)),
     }
+
+
+def keep_steadiest(
+    settings: Settings, key: jax.Array, policies: LinearGaussian
+) -> tuple[int, dict[int, float]]:
+    """Drive with the policies of some iterations, and choose the one that stays up longest.
+
+    Args:
+        settings: The settings.
+        key: Random key; the evaluation uses another one.
+        policies: Policies whose `coef` has a leading axis, the iterations.
+
+    Returns:
+        Index of the chosen iteration, and the share of time that each candidate is up, by its index.
+    """
+    last = len(policies.coef) - 1
+    indices = np.unique(np.linspace(last // 2, last, settings.candidates).round().astype(int))
+    drives = random_commands(1, settings.candidate_drives, settings.candidate_seconds)
+
+    @jax.jit
+    def share_of_time(coef: jax.Array) -> jax.Array:
+        walker = learned_walker(as_learned(settings, policies._replace(coef=coef)))
+        driven = drive_all(settings, walker, key, drives, noise=settings.learning_noise)
+        return 1.0 - jnp.mean(driven.has_fallen)
+
+    upright = {int(index): float(share_of_time(jnp.asarray(policies.coef[index]))) for index in indices}
+    return max(upright, key=lambda index: (upright[index], index)), upright
 
 
 def evaluate_policy(
@@ -328,9 +369,15 @@ def evaluate_policy(
         "speed": np.asarray(outcome.speed),
         "error": np.asarray(outcome.error),
         "fell": np.asarray(outcome.fell),
-        **named("drive", {"fell": usual.has_fallen[:, -1]}),
-        **named("noisy_drive", {"fell": noisy.has_fallen[:, -1]}),
-        **named("stop", {"fell": stopped.has_fallen[:, -1], "seconds": time_to_stand(stopped.stage)}),
+        **named("drive", {"fell": np.asarray(usual.has_fallen[:, -1])}),
+        **named("noisy_drive", {"fell": np.asarray(noisy.has_fallen[:, -1])}),
+        **named(
+            "stop",
+            {
+                "fell": np.asarray(stopped.has_fallen[:, -1]),
+                "seconds": time_to_stand(np.asarray(stopped.stage)),
+            },
+        ),
     }
 
 

@@ -52,8 +52,8 @@ class SteeringReward(NamedTuple):
     search in which all samples fall has a direction.
     """
 
-    speed: float = 10.0
-    turn: float = 1.0
+    speed: float = 30.0
+    turn: float = 3.0
     fall: float = 30.0
     upright: float = 0.5
 

@@ -24,23 +24,27 @@ from creps_jax.tasks.closed_loop import (
     make_setup,
 )
 from creps_jax.tasks.steering import moved
-from creps_jax.tools.drive import AVERAGED, in_words, load_walker
+from creps_jax.tools.drive import AVERAGED, in_words
+from creps_jax.tools.play import load_walking_policy
 from creps_jax.walking.controller import Walker
+from creps_jax.walking.gaits import command_range, learned_walker
 
 
 class Command:
-    """The command that keys change, a step at a time."""
+    """The command that keys change, a step at a time, between the lowest and the highest of a policy."""
 
     steps = (0.05, 0.05, 0.2)
 
-    def __init__(self) -> None:
+    def __init__(self, low: np.ndarray, high: np.ndarray) -> None:
         self.value = np.zeros(3, np.float32)
+        self._low, self._high = low, high
 
     def press(self, key: int) -> None:
         """Change the command by a key of GLFW: arrows, comma and full stop, space."""
         axis, sign = _KEYS.get(key, (None, 0))
         if axis is not None:
-            self.value[axis] = np.round(self.value[axis] + sign * self.steps[axis], 3)
+            wanted = np.round(self.value[axis] + sign * self.steps[axis], 3)
+            self.value[axis] = np.clip(wanted, self._low[axis], self._high[axis])
         elif key == _SPACE:
             self.value[:] = 0.0
 
@@ -61,7 +65,8 @@ def drive_live(policy: Path, *, say: Callable[[str], None]) -> None:
     Raises:
         UserError: if the policy cannot be driven, or there is no screen.
     """
-    walker = load_walker(policy)
+    learned = load_walking_policy(policy, can_steer=True)
+    walker = learned_walker(learned)
     say(f"policy: {policy}")
     if sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
@@ -73,7 +78,7 @@ def drive_live(policy: Path, *, say: Callable[[str], None]) -> None:
 
     model = mujoco.MjModel.from_xml_path(str(model_path(walker.robot)))
     data = mujoco.MjData(model)
-    command, live = Command(), LiveRobot(walker)
+    command, live = Command(*command_range(learned)), LiveRobot(walker)
     with mujoco.viewer.launch_passive(
         model, data, key_callback=command.press, show_left_ui=False, show_right_ui=False
     ) as viewer:

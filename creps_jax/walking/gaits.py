@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from creps_jax import checks
 from creps_jax.policies.learned import Learned
@@ -17,6 +18,8 @@ __all__ = [
     "AHEAD",
     "COMMAND_NAMES",
     "COMMAND_UNITS",
+    "command_range",
+    "is_steered",
     "learned_walker",
     "limited_command",
     "steered_gait",
@@ -89,7 +92,8 @@ def learned_walker(learned: Learned, **settings: Any) -> Walker:
     out of its range, and steps to the side and turns are those of the command.
 
     Args:
-        learned: A policy of `nao_walk` or `nao_steered_walk`. Conditions, such as a slope, are taken as zero.
+        learned: A policy of `nao_walk` or `nao_steered_walk`. Conditions, such as a slope, are taken as zero,
+            or as the end of their range next to zero.
         settings: Settings of `Walker`, such as `period`; the others are those of learning.
 
     Raises:
@@ -97,13 +101,13 @@ def learned_walker(learned: Learned, **settings: Any) -> Walker:
     """
     checks.instance("learned", learned, Learned)
     names, task = learned.contexts.names, learned.task
-    if names[:1] != ("speed",) and names != COMMAND_NAMES:
+    if names[:1] != ("speed",) and not is_steered(learned):
         expected = f"speed, or {', '.join(COMMAND_NAMES)}"
         raise ValueError(f"learned must be a walk whose contexts are {expected}, got {', '.join(names)}")
     robot = task.get("robot", NAO.name)
     if robot not in ROBOTS:
         raise ValueError(f"the robot of learned must be one of {', '.join(ROBOTS)}, got {robot!r}")
-    gait = _command_gait(learned) if names == COMMAND_NAMES else _speed_gait(learned)
+    gait = _command_gait(learned) if is_steered(learned) else _speed_gait(learned)
     defaults = {
         "robot": ROBOTS[robot],
         "balance": Balance(**task.get("balance", {})),
@@ -114,12 +118,31 @@ def learned_walker(learned: Learned, **settings: Any) -> Walker:
     return Walker(gait, **(defaults | settings))
 
 
+def is_steered(learned: Learned) -> bool:
+    """Return whether the context of a policy begins with a command (vx, vy, turn rate)."""
+    return learned.contexts.names[: len(COMMAND_NAMES)] == COMMAND_NAMES
+
+
+def command_range(learned: Learned) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Return the lowest and the highest command of a learned walk, m/s and rad/s.
+
+    A policy for a speed limits the forward speed only: the other ends are infinite.
+    """
+    if is_steered(learned):
+        low, high = learned.contexts.low[:3], learned.contexts.high[:3]
+        return np.asarray(low, np.float32), np.asarray(high, np.float32)
+    highest = np.array([learned.contexts.high[0], np.inf, np.inf], np.float32)
+    return -highest, highest
+
+
 def _command_gait(learned: Learned) -> Callable[[Array], Gait]:
-    low, high = learned.contexts.low, learned.contexts.high
+    low, high = command_range(learned)
 
     def gait(command: Float[Array, "3"]) -> Gait:
         ends = (jnp.asarray(end, command.dtype) for end in (low, high))
-        return steered_gait(learned.thetas(limited_command(command, *ends)[None])[0])
+        context = _conditions_at_rest(learned).astype(command.dtype)
+        context = context.at[: len(COMMAND_NAMES)].set(limited_command(command, *ends))
+        return steered_gait(learned.thetas(context[None])[0])
 
     return gait
 
@@ -129,9 +152,14 @@ def _speed_gait(learned: Learned) -> Callable[[Array], Gait]:
 
     def gait(command: Float[Array, "3"]) -> Gait:
         speed = jnp.clip(jnp.abs(command[0]), low, high)
-        context = jnp.zeros(learned.contexts.size, command.dtype).at[0].set(speed)
+        context = _conditions_at_rest(learned).astype(command.dtype).at[0].set(speed)
         params = params_from_theta(learned.thetas(context[None])[0])
         ahead = params.step_length * jnp.clip(command[0] / speed, -1.0, 1.0)
         return Gait(params, jnp.stack([ahead, *(params.step_duration * command[1:])]))
 
     return gait
+
+
+def _conditions_at_rest(learned: Learned) -> Array:
+    """Return a context (k,) whose conditions are as near to zero as their range allows."""
+    return jnp.clip(0.0, jnp.asarray(learned.contexts.low), jnp.asarray(learned.contexts.high))

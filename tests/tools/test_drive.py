@@ -5,10 +5,12 @@ import pytest
 
 from creps_jax.errors import UserError
 from creps_jax.files import policies_folder
+from creps_jax.policies.learned import load
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tools import cli
 from creps_jax.tools.drive import captions, drive_by_commands, load_walker, read_script, report
 from creps_jax.tools.drive_live import Command, LiveRobot
+from creps_jax.walking.gaits import command_range
 
 SCRIPT = "time,vx,vy,turn\n0,0.2,0,0\n1.5,0,0,0.4\n2,0,0,0\n"
 
@@ -62,7 +64,7 @@ def test_a_drive_is_reported_and_captioned(walker):
 
 
 def test_keys_change_the_command():
-    command = Command()
+    command = Command(np.full(3, -1.0), np.full(3, 1.0))
     for key in (265, 265, 263, 44):
         command.press(key)
     np.testing.assert_allclose(command.value, [0.1, 0.05, 0.2])
@@ -70,6 +72,16 @@ def test_keys_change_the_command():
     np.testing.assert_allclose(command.value, [0.1, 0.05, 0.2])
     command.press(32)
     np.testing.assert_allclose(command.value, 0.0)
+
+
+def test_keys_keep_the_command_in_the_range_of_the_policy():
+    learned = load(policies_folder() / "steer.npz")
+    command = Command(*command_range(learned))
+    for key in (264, 44, 262):
+        for _ in range(30):
+            command.press(key)
+    low, high = learned.contexts.low, learned.contexts.high
+    np.testing.assert_allclose(command.value, [low[0], high[1], low[2]], atol=1e-6)
 
 
 def test_a_live_robot_walks_and_starts_again_after_a_fall(walker):

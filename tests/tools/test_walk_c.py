@@ -13,7 +13,9 @@ import pytest
 from jax import lax
 
 from creps_jax.files import policies_folder
+from creps_jax.policies.features import polynomial_features
 from creps_jax.policies.learned import load
+from creps_jax.policies.space import Space
 from creps_jax.robots.nao_geometry import JOINT_NAMES
 from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.tools.export import walk_c
@@ -33,6 +35,24 @@ WALKS = {
 def policy_of(robot, name, com):
     policy = load(policies_folder(robot) / f"{name}.npz")
     return dataclasses.replace(policy, task={**policy.task, "com": com})
+
+
+def with_friction(policy):
+    """Return a policy of a steered walk that depends on the friction of the floor, 0.4 to 1, too."""
+    contexts = policy.contexts
+    features = polynomial_features(contexts.size + 1, 2)
+    wider = dataclasses.replace(
+        policy,
+        features=features,
+        contexts=Space(
+            (*contexts.names, "friction"), (*contexts.low, 0.4), (*contexts.high, 1.0), (*contexts.units, "")
+        ),
+        policy=policy.policy._replace(coef=jnp.zeros((features.size, policy.parameters.size))),
+    )
+    before = dict(zip(walk_c.exponents(policy), np.asarray(policy.policy.coef), strict=True))
+    extra = np.full(policy.parameters.size, 0.05)
+    coef = [before.get(row[:-1], extra) if row[-1] == 0 else extra for row in walk_c.exponents(wider)]
+    return dataclasses.replace(wider, policy=policy.policy._replace(coef=jnp.asarray(coef, jnp.float32)))
 
 
 class CWalk:
@@ -74,11 +94,13 @@ def changing_commands(num, seed=0):
 
 @needs_compiler
 @pytest.mark.parametrize("period", [0.02, 0.012])
-@pytest.mark.parametrize("walk", WALKS)
+@pytest.mark.parametrize("walk", [*WALKS, "steered with a condition"])
 def test_set_points_are_those_of_python(walk, period, tmp_path):
     if period != 0.02 and walk != "steered":
         pytest.skip("one walk is enough for another period")
-    policy = policy_of(*WALKS[walk])
+    policy = policy_of(*WALKS[walk.removesuffix(" with a condition")])
+    if walk.endswith("with a condition"):
+        policy = with_friction(policy)
     num = round(20.0 / period)
     commands = changing_commands(num)
     rpy = 0.1 * np.cumsum(np.random.default_rng(1).normal(0.0, 0.01, (num, 3)), axis=0)

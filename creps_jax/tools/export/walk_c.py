@@ -19,7 +19,7 @@ from creps_jax.tools.export.c_header import floats, identifier, number
 from creps_jax.tools.export.formula import formula_of
 from creps_jax.walking import com_plan, controller, engine, footsteps, gaits, params, posture
 from creps_jax.walking.controller import Walker
-from creps_jax.walking.gaits import COMMAND_NAMES, learned_walker
+from creps_jax.walking.gaits import COMMAND_NAMES, command_range, is_steered, learned_walker
 
 _KINDS = ("linear", "polynomial", "rbf")
 
@@ -52,7 +52,7 @@ def make_walk(policy: Learned, name: str = "walk", *, period: float = 0.02) -> t
     except (TypeError, ValueError) as error:
         raise UserError(f"the policy cannot be written as a walk: {error}") from error
     robot = walker.robot
-    ranges = zip(COMMAND_NAMES, *_command_ranges(policy), strict=True)
+    ranges = zip(COMMAND_NAMES, *command_range(policy), strict=True)
     filled = {
         "VERSION": package_version(),
         "ROBOT": robot.name,
@@ -78,15 +78,6 @@ def _fill(file: str, filled: dict[str, str], prefix: str) -> str:
     text = re.sub(r"\bWALK_(?=\w)", f"{prefix.upper()}_", text)
     filled = filled | {"RANGES": filled["RANGES"].replace("WALK_", f"{prefix.upper()}_")}
     return re.sub(r"@(\w+)@", lambda found: filled[found[1]], text)
-
-
-def _command_ranges(policy: Learned) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and highest command that the walk follows; infinite if steps are not limited."""
-    formula = formula_of(policy, _KINDS)
-    if policy.contexts.names[:3] == COMMAND_NAMES:
-        return formula.context_low[:3], formula.context_high[:3]
-    high = np.array([formula.context_high[0], np.inf, np.inf], np.float32)
-    return -high, high
 
 
 def _constants(policy: Learned, walker: Walker) -> list[str]:
@@ -149,7 +140,7 @@ def _constants(policy: Learned, walker: Walker) -> list[str]:
     flags = {
         "ONE_YAW_MOTOR": robot.has_one_yaw_motor,
         "IS_ONE_STEP": walker.com == "one_step",
-        "IS_STEERED": policy.contexts.names[:3] == COMMAND_NAMES,
+        "IS_STEERED": is_steered(policy),
         "IS_SQUASHED": policy.parameters.constraint == SIGMOID,
     }
     return [

@@ -286,6 +286,12 @@ static void read_gait(const float command[3], float params[10], float step[3])
     int i;
 #if IS_STEERED
     float length = 0.0f;
+#endif
+    /* Conditions are as near to zero as their range allows. */
+    for (i = 0; i < NUM_CONTEXTS; ++i) {
+        context[i] = clip(0.0f, CONTEXT_LOW[i], CONTEXT_HIGH[i]);
+    }
+#if IS_STEERED
     for (i = 0; i < 3; ++i) {
         const float middle = 0.5f * (CONTEXT_LOW[i] + CONTEXT_HIGH[i]);
         const float half = 0.5f * (CONTEXT_HIGH[i] - CONTEXT_LOW[i]);
@@ -299,9 +305,6 @@ static void read_gait(const float command[3], float params[10], float step[3])
         context[i] = middle + half * context[i] / length;
     }
 #else
-    for (i = 0; i < NUM_CONTEXTS; ++i) {
-        context[i] = 0.0f;
-    }
     context[0] = clip(fabsf(command[0]), CONTEXT_LOW[0], CONTEXT_HIGH[0]);
 #endif
     compute_theta(context, theta);
