@@ -71,11 +71,11 @@ class Settings:
         degree: degree of the polynomial features of the command.
         start_std: standard deviation of the first policy, before squashing.
         start_policy: policy file of this experiment to continue, instead of a first policy from scratch; with
-            its own deviations.
+            its own deviations, those of the last iteration.
         learning_noise: factor of the usual noise in learning: so large that many samples fall. Where falls
             are rare, rewards differ in the speeds only, and the search does not learn to stay up.
-        candidates: number of policies, from equally spaced iterations of the second half of learning; kept is
-            the one that stays up longest in drives by random commands in the noise of learning.
+        candidates: number of policies, from equally spaced iterations of the second half of learning. The
+            policy that stays up longest in drives by random commands, in the noise of learning, is kept.
         candidate_drives: number of drives of each candidate.
         candidate_seconds: length of a drive of a candidate, s.
         learning_duration: length of an episode in learning, s.
@@ -337,7 +337,8 @@ def keep_steadiest(
         Index of the chosen iteration, and the share of time that each candidate is up, by its index.
     """
     last = len(policies.coef) - 1
-    indices = np.unique(np.linspace(last // 2, last, settings.candidates).round().astype(int))
+    # From the last iteration on: with one candidate it is the last policy.
+    indices = np.unique(np.linspace(last, last // 2, settings.candidates).round().astype(int))
     drives = random_commands(1, settings.candidate_drives, settings.candidate_seconds)
 
     @jax.jit

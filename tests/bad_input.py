@@ -388,6 +388,7 @@ INNER = {
     "com_velocities",
     "compose",
     "continuous_com_trajectory",
+    "command_context",
     "command_range",
     "filter_memory",
     "is_steered",

@@ -55,10 +55,11 @@ class Condition(NamedTuple):
 
 @checks.arguments
 def slope(low: float, high: float) -> Condition:
-    """Let the floor rise ahead of the robot by an angle in degrees; with a negative angle it descends.
+    """Let the floor rise along x of the world, by an angle in degrees; with a negative angle it descends.
 
     All positions, and so the speed, are in the frame of the floor; gravity is rotated about y instead. The
-    robot knows the slope: its steps follow the floor, and its lean is measured from the vertical.
+    robot starts along x, and knows the slope: its steps follow the floor, and its lean is measured from the
+    vertical.
 
     Args:
         low: Lowest slope, deg; above -90.

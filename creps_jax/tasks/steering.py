@@ -99,7 +99,7 @@ def nao_steered_walk(
     start_up: float = 2.0,
     reward: SteeringReward = SteeringReward(),
     noise: WalkNoise = WalkNoise(),
-    balance: Balance = Balance(0.0, 0.6),
+    balance: Balance = Balance(0.0, 0.6, 0.06),
     conditions: Sequence[Condition] = (),
     robot: Robot = NAO,
     model: mujoco.MjModel | None = None,

@@ -183,7 +183,8 @@ def load_walking_policy(path: Path, robot: str | None = None, *, can_steer: bool
         found = ", ".join(policy.parameters.names)
         raise UserError(f"{path} is no walking policy: its parameters are {found}")
     try:
-        is_finite = all(math.isfinite(gain) for gain in balance_of(policy))  # type: ignore[arg-type]
+        balance = balance_of(policy)
+        is_finite = all(map(math.isfinite, balance)) and balance.filter_time >= 0.0  # type: ignore[arg-type]
     except (KeyError, TypeError):
         is_finite = False
     if not is_finite:

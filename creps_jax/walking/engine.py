@@ -118,7 +118,7 @@ def stand_upright(pose: BodyPose, slope: Scalar, yaw: ScalarLike = 0.0) -> BodyP
     Args:
         pose: A pose planned for level ground, in a frame on the floor.
         slope: Angle by which the floor rises uphill, rad.
-        yaw: Angle from uphill to the x axis of the frame, rad.
+        yaw: Heading of the frame's x axis, from uphill, rad.
 
     Returns:
         The pose with the hips farther uphill, by the tangent of the slope times their height.

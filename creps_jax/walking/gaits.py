@@ -18,6 +18,7 @@ __all__ = [
     "AHEAD",
     "COMMAND_NAMES",
     "COMMAND_UNITS",
+    "command_context",
     "command_range",
     "is_steered",
     "learned_walker",
@@ -123,6 +124,17 @@ def is_steered(learned: Learned) -> bool:
     return learned.contexts.names[: len(COMMAND_NAMES)] == COMMAND_NAMES
 
 
+def command_context(learned: Learned, command: Float[Array, "*c"]) -> Float[Array, " k"]:
+    """Return the context of a command; conditions are as near to zero as their range allows.
+
+    Args:
+        learned: A learned walk.
+        command: The speed (), or the command (3,), as the contexts of the policy begin.
+    """
+    rest = jnp.clip(0.0, jnp.asarray(learned.contexts.low), jnp.asarray(learned.contexts.high))
+    return rest.astype(command.dtype).at[: command.size].set(command)
+
+
 def command_range(learned: Learned) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
     """Return the lowest and the highest command of a learned walk, m/s and rad/s.
 
@@ -140,8 +152,7 @@ def _command_gait(learned: Learned) -> Callable[[Array], Gait]:
 
     def gait(command: Float[Array, "3"]) -> Gait:
         ends = (jnp.asarray(end, command.dtype) for end in (low, high))
-        context = _conditions_at_rest(learned).astype(command.dtype)
-        context = context.at[: len(COMMAND_NAMES)].set(limited_command(command, *ends))
+        context = command_context(learned, limited_command(command, *ends))
         return steered_gait(learned.thetas(context[None])[0])
 
     return gait
@@ -152,14 +163,9 @@ def _speed_gait(learned: Learned) -> Callable[[Array], Gait]:
 
     def gait(command: Float[Array, "3"]) -> Gait:
         speed = jnp.clip(jnp.abs(command[0]), low, high)
-        context = _conditions_at_rest(learned).astype(command.dtype).at[0].set(speed)
+        context = command_context(learned, speed)
         params = params_from_theta(learned.thetas(context[None])[0])
         ahead = params.step_length * jnp.clip(command[0] / speed, -1.0, 1.0)
         return Gait(params, jnp.stack([ahead, *(params.step_duration * command[1:])]))
 
     return gait
-
-
-def _conditions_at_rest(learned: Learned) -> Array:
-    """Return a context (k,) whose conditions are as near to zero as their range allows."""
-    return jnp.clip(0.0, jnp.asarray(learned.contexts.low), jnp.asarray(learned.contexts.high))

@@ -47,5 +47,5 @@ def open_loop_walk(walker: Walker, commands: Float[Array, "n 3"]) -> WalkerState
         return state, state
 
     start = undisturbed.start()
-    _, states = lax.scan(step, start, commands)
+    _, states = lax.scan(step, start, commands.astype(start.command.dtype))
     return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, states)

@@ -19,7 +19,7 @@ class Balance(NamedTuple):
     Attributes:
         heading_gain: Share of the heading error that one step turns back.
         placement_gain: Share of the way by which a sideways tilt carries the hips out, that a landing foot is
-            put out to the same side. The tilt counts as it is at each time. The swing foot is put
+            put out to the same side. The present tilt counts, filtered. The swing foot is put
             out by a part of the share that grows to all of it; the other foot keeps what is left of its own
             while the body is carried over.
         filter_time: Time constant of the filter for the measured roll and pitch, s, see `next_tilt`; 0 for
@@ -52,7 +52,8 @@ def next_tilt(tilt: Tilt, measured: Float[Array, "2"], period: ScalarLike, filte
     """Update the estimate of the tilt with a measurement.
 
     The filter is a line fitted to all measurements so far, whose weights fall exponentially with their age:
-    it has no lag while the tilt changes at a constant rate.
+    it has no lag while the tilt changes at a constant rate. Measurements are clipped to 0.8 rad, so that a
+    wrong one is soon forgotten.
 
     Args:
         tilt: The estimate one period ago.
@@ -67,6 +68,7 @@ def next_tilt(tilt: Tilt, measured: Float[Array, "2"], period: ScalarLike, filte
     filter of degree 1.
     """
     memory = filter_memory(period, filter_time).astype(measured.dtype)
+    measured = jnp.clip(measured, -MAX_MEASURED, MAX_MEASURED)
     surprise = measured - (tilt.angle + period * tilt.rate)
     return Tilt(measured - memory**2 * surprise, tilt.rate + (1.0 - memory) ** 2 / period * surprise)
 

@@ -61,6 +61,24 @@ def test_what_is_learned_from_samples_and_mirror_images_is_symmetric():
     np.testing.assert_allclose(mirrored, np.asarray(means) * signs, atol=2e-3)
 
 
+@pytest.mark.parametrize(("candidates", "tried"), [(1, [20]), (3, [10, 15, 20])])
+def test_the_policy_that_stays_up_longest_is_kept_and_the_latest_of_equals(candidates, tried, monkeypatch):
+    first = steer.first_policy(SETTINGS)
+    swing = steer.STEERED_PARAM_NAMES.index("swing_height")
+    # The swing is lower, and falls in this test, at iteration 10 alone.
+    coef = jnp.tile(first.coef, (21, 1, 1)).at[10, 0, swing].add(-2.0)
+
+    def drive_all(settings, walker, key, commands, *, noise):
+        is_low = walker.gait(jnp.zeros(3)).params.swing_height < 0.03
+        return steer.Drive(*[None] * 6, has_fallen=jnp.full((2, 5), is_low))
+
+    monkeypatch.setattr(steer, "drive_all", drive_all)
+    settings = dataclasses.replace(SETTINGS, candidates=candidates, candidate_drives=2, candidate_seconds=1.0)
+    kept, upright = steer.keep_steadiest(settings, jax.random.key(0), first._replace(coef=coef))
+    assert list(upright) == tried and kept == 20
+    assert upright[20] == 1.0 and upright.get(10, 0.0) == 0.0
+
+
 def test_the_time_to_stand_counts_from_the_command_to_stop():
     stage = np.full((2, 700), Stage.WALKING)
     stage[0, 260:] = Stage.STANDING

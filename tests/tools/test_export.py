@@ -20,7 +20,7 @@ import pytest
 from creps_jax.errors import UserError
 from creps_jax.files import load_arrays, policies_folder
 from creps_jax.policies.feature_settings import Features
-from creps_jax.policies.features import quadratic_features
+from creps_jax.policies.features import linear_features, quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned, load, save
 from creps_jax.policies.space import Space
@@ -279,6 +279,31 @@ def test_a_steered_walk_is_written_as_its_walker_walks_straight_ahead(folder):
     np.testing.assert_allclose(load_arrays(folder / "walk.npz")["set_point"], states.set_point, atol=1e-5)
     # As it was learned, the command rises by its acceleration.
     assert 0.0 < states.command[20, 0] < 0.3 and states.origin[-1, 0] > 0.2
+
+
+@pytest.mark.parametrize("policy", [STEERED, policies_folder() / "walk.npz"])
+def test_the_fastest_walk_can_be_written(policy, folder):
+    arguments = ["--to", "walk.npz", "--duration", "0.1", "--policy", str(policy)]
+    assert main(["export", *arguments, "--speed", "0.6"]) == 0
+    assert main(["export", *arguments, "--speed", "0.7"]) == 2
+
+
+def test_a_steered_walk_with_a_condition_is_written(folder):
+    learned = load(STEERED)
+    contexts = learned.contexts
+    wider = Space(
+        (*contexts.names, "friction"), (*contexts.low, 0.4), (*contexts.high, 1.0), (*contexts.units, "")
+    )
+    coef = jnp.zeros((5, learned.parameters.size))
+    learned = dataclasses.replace(
+        learned, contexts=wider, features=linear_features(4), policy=learned.policy._replace(coef=coef)
+    )
+    save(folder / "wider.npz", learned)
+    assert (
+        main(["export", "--policy", "wider.npz", "--to", "walk.csv", "--speed", "0.2", "--duration", "1"])
+        == 0
+    )
+    assert main(["export", "--policy", "wider.npz", "--to", "walk.c"]) == 0
 
 
 def test_a_robot_gets_its_own_policy_and_set_points(folder, capsys):

@@ -16,7 +16,7 @@ from creps_jax.tasks.closed_loop import CONTROL_PERIOD, WalkNoise, is_robot_fall
 from creps_jax.tools import tables
 from creps_jax.tools.play import load_walking_policy, robot_of
 from creps_jax.walking.controller import Walker
-from creps_jax.walking.gaits import AHEAD, COMMAND_NAMES, learned_walker, straight_walker
+from creps_jax.walking.gaits import AHEAD, command_context, is_steered, learned_walker, straight_walker
 from creps_jax.walking.open_loop import open_loop_walk
 
 # A walk of this duration has 600,000 rows at the shortest period.
@@ -65,12 +65,14 @@ def plan(
         raise UserError(f"{path} is no walking policy: its task is {policy.task.get('name')!r}")
     if not period <= duration <= _LONGEST:
         raise UserError(f"--duration must be {period} to {_LONGEST:g} s, got {duration}")
-    if policy.contexts.names == COMMAND_NAMES:
-        command = policy.contexts.checked((speed, 0.0, 0.0))
-        walker = learned_walker(policy, period=period)
+    asked = (speed, 0.0, 0.0) if is_steered(policy) else (speed,)
+    conditions = command_context(policy, jnp.asarray(asked)).tolist()[len(asked) :]
+    context = policy.contexts.checked((*asked, *conditions))
+    if is_steered(policy):
+        command, walker = asked, learned_walker(policy, period=period)
     else:
         command = AHEAD
-        walker = straight_walker(jnp.asarray(policy.theta(speed)), robot=robot_of(policy), period=period)
+        walker = straight_walker(jnp.asarray(policy.theta(context)), robot=robot_of(policy), period=period)
     commands = jnp.tile(jnp.asarray(command, jnp.float32), (round(duration / period), 1))
     walk = jax.jit(lambda commands: open_loop_walk(walker, commands).set_point)
     set_point = np.asarray(walk(commands))

@@ -716,8 +716,13 @@ static void filter_tilt(float *angle, float *rate, float measured)
 {
     const float memory = FILTER_MEMORY, forgotten = 1.0f - memory;
     const float predicted = *angle + WALK_PERIOD * *rate;
-    /* What is not finite counts as missing: the estimate goes on. */
-    const float surprise = isfinite(measured) ? measured - predicted : 0.0f;
+    float surprise;
+    if (!isfinite(measured)) {
+        /* A missing measurement: the angle stays, and the rate fades. */
+        *rate *= memory;
+        return;
+    }
+    surprise = clip(measured, -MAX_MEASURED, MAX_MEASURED) - predicted;
     *angle = predicted + (1.0f - memory * memory) * surprise;
     *rate += forgotten * forgotten / WALK_PERIOD * surprise;
 }
@@ -765,7 +770,11 @@ void walk_step(
     const int was_standing = state->stage == WALK_STANDING;
     body_pose pose;
     int is_over, i;
-    yaw = isfinite(yaw) ? yaw : state->origin[2];
+    /* A missing yaw: the robot heads as planned. */
+    if (!isfinite(yaw)) {
+        const float turned = smooth_step(state->time / state->params[STEP_DURATION]);
+        yaw = state->origin[2] + (1.0f - turned) * state->yaw[0] + turned * state->yaw[1];
+    }
     filter_tilt(&state->tilt[0], &state->tilt_rate[0], roll);
     filter_tilt(&state->tilt[1], &state->tilt_rate[1], pitch);
     for (i = 0; i < 3; ++i) {

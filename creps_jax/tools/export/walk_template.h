@@ -61,7 +61,9 @@ void walk_start(walk_state *state, float out[WALK_NUM_JOINTS]);
  * command: wanted speed forward and to the left (m/s) and turn rate (rad/s); it is followed with limited
  *     acceleration.
  * roll, pitch, yaw: measured orientation of the trunk, rad: roll to the right and pitch forward are positive;
- *     yaw to the left, of any turn.
+ *     yaw to the left, of any turn. NAN where a measurement is missing: roll and pitch stay as they were, and
+ *     the heading counts as planned. A command that is not finite counts as zero. Both need a build without
+ *     -ffast-math.
  * out: joint set-points for the end of the period, rad.
  */
 void walk_step(
