@@ -113,7 +113,7 @@ class Settings:
     learning_duration: float = 6.4
     duration: float = 8.0
     heading_gain: float = 0.0
-    placement_gain: float = 0.6
+    placement_gain: float = 0.5
     filter_time: float = 0.06
     acceleration: tuple[float, float, float] = (0.7, 0.08, 0.4)
     learning_acceleration: tuple[float, float, float] = (0.6, 0.4, 2.0)

@@ -53,7 +53,7 @@ class SteeringReward(NamedTuple):
     """
 
     speed: float = 30.0
-    turn: float = 3.0
+    turn: float = 6.0
     fall: float = 30.0
     upright: float = 0.5
 

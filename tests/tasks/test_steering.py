@@ -46,7 +46,7 @@ def test_it_walks_about_as_it_is_told(walks):
 
 def test_the_reward_is_the_weighted_square_of_the_error(walks):
     _, outcome = walks
-    wanted = -np.sum(np.asarray(outcome.error) ** 2 * np.array([30.0, 30.0, 3.0]), axis=1)
+    wanted = -np.sum(np.asarray(outcome.error) ** 2 * np.array([30.0, 30.0, 6.0]), axis=1)
     np.testing.assert_allclose(outcome.reward, wanted, rtol=1e-4)
 
 
