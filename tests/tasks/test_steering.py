@@ -31,7 +31,9 @@ def theta_of(vx, vy, turn):
 def walks():
     """Outcomes of commands straight ahead, backward, to the left and turning."""
     commands = jnp.array([[0.2, 0.0, 0.0], [-0.15, 0.0, 0.0], [0.05, 0.1, 0.0], [0.05, 0.0, 0.6]])
-    task = nao_steered_walk(duration=4.0, start_up=1.5, noise=QUIET, physics=c.make_control_step)
+    # The gait was set for the tilt as it is measured.
+    settings = {"noise": QUIET, "balance": Balance(0.0, 0.6), "physics": c.make_control_step}
+    task = nao_steered_walk(duration=4.0, start_up=1.5, **settings)
     thetas = jnp.stack([theta_of(*command) for command in commands])
     keys = jax.random.split(jax.random.key(0), len(commands))
     return commands, jax.jit(jax.vmap(task.rollout))(keys, commands, thetas)

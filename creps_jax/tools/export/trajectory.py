@@ -66,7 +66,7 @@ def plan(
     if not period <= duration <= _LONGEST:
         raise UserError(f"--duration must be {period} to {_LONGEST:g} s, got {duration}")
     asked = (speed, 0.0, 0.0) if is_steered(policy) else (speed,)
-    conditions = command_context(policy, jnp.asarray(asked)).tolist()[len(asked) :]
+    conditions = command_context(policy, jnp.zeros(len(asked))).tolist()[len(asked) :]
     context = policy.contexts.checked((*asked, *conditions))
     if is_steered(policy):
         command, walker = asked, learned_walker(policy, period=period)
