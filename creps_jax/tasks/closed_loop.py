@@ -98,7 +98,7 @@ class Walk(NamedTuple):
     @property
     def slope(self) -> ScalarLike:
         """Angle by which the floor rises along x of the world, rad: the robot is told."""
-        return 0.0 if self.circumstances is None else slope_angle(self.circumstances.world)
+        return _slope_in(self.circumstances)
 
 
 class WalkState(NamedTuple):
@@ -175,7 +175,7 @@ def begin(
     """
     start_key, lean_key, set_point_key = jax.random.split(key, 3)
     circumstances = circumstances_of(setup.conditions, values, setup.world)
-    slope = 0.0 if circumstances is None else slope_angle(circumstances.world)
+    slope = _slope_in(circumstances)
     standing = walker.start(slope)
     dtype = standing.set_point.dtype
     lean_noise = setup.noise.lean * jax.random.normal(lean_key, (setup.num_ticks, 3), dtype)
@@ -260,6 +260,11 @@ def is_robot_fallen(
     rotation = quat_to_matrix(robot.qpos[3:7])
     cosine = rotation[2, 2] if up is None else up @ rotation[:, 2]
     return ~(is_high & (cosine > _FALLEN_COSINE))
+
+
+def _slope_in(circumstances: Circumstances | None) -> ScalarLike:
+    """Return the angle by which the floor rises along x of the world, rad; without conditions it is level."""
+    return 0.0 if circumstances is None else slope_angle(circumstances.world)
 
 
 def _count_substeps(model: mujoco.MjModel) -> int:
