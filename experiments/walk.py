@@ -128,8 +128,9 @@ def finish(settings: Settings, arrays: Arrays, folder: Path, say: Callable[[str]
     """Write the table as CSV too, and policy and video of the chosen trial."""
     files.save_text(folder / "table.csv", tables.to_csv(table(arrays)))
     policy = save_policy(settings, arrays, folder, say)
-    clips = record(policy, filmed_speeds(policy), seed=0, duration=settings.duration)
-    save_film(clips, folder / "walk.mp4", say, robot=settings.ranges().robot)
+    robot = settings.ranges().robot
+    clips = record(policy, filmed_speeds(policy), seed=0, robot=robot, duration=settings.duration)
+    save_film(clips, folder / "walk.mp4", say, robot=robot)
 
 
 def save_policy(settings: Settings, arrays: Arrays, folder: Path, say: Callable[[str], None]) -> Learned:

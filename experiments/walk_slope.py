@@ -214,8 +214,9 @@ def finish(settings: Settings, arrays: Arrays, folder: Path, say: Callable[[str]
     """Write policy and video of the chosen trial."""
     policy = walk.save_policy(settings, arrays, folder, say)
     speeds, slopes = zip(*FILMED, strict=True)
-    clips = record(policy, speeds, seed=0, duration=settings.duration, slopes=slopes)
-    save_film(clips, folder / "walk_slope.mp4", say, robot=settings.ranges().robot)
+    robot = settings.ranges().robot
+    clips = record(policy, speeds, seed=0, robot=robot, duration=settings.duration, slopes=slopes)
+    save_film(clips, folder / "walk_slope.mp4", say, robot=robot)
 
 
 def table(arrays: Arrays) -> dict[str, list[object]]:

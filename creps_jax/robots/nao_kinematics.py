@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from creps_jax import checks
 from creps_jax.numerics.rotations import rigid_transform, rotation_x, rotation_y, rotation_z, safe_arctan2
 from creps_jax.robots.nao_geometry import LEFT, RIGHT, NaoGeometry, leg_indices
-from creps_jax.robots.robot import NAO, Robot
+from creps_jax.robots.robot import NAO, NaoRobot
 from creps_jax.typing import Scalar, ScalarLike
 
 __all__ = ["MAX_REACH", "MIN_REACH", "leg_fk", "leg_ik", "leg_reach"]
@@ -43,13 +43,13 @@ class _Links(NamedTuple):
         return sqrt(self.thigh**2 + self.shank**2 + 2.0 * self.thigh * self.shank * cos(bend))
 
 
-def leg_links(robot: Robot) -> _Links:
+def leg_links(robot: NaoRobot) -> _Links:
     """Return the links of a leg of a robot, m and rad."""
     forward, down = robot.geometry.thigh_forward, robot.geometry.thigh_down
     return _Links(hypot(forward, down), robot.geometry.shank_down, atan2(forward, down))
 
 
-def leg_reach(robot: Robot = NAO) -> tuple[float, float]:
+def leg_reach(robot: NaoRobot = NAO) -> tuple[float, float]:
     """Return the least and the largest distance (m) between a robot's hip and its ankle pitch axis.
 
     The distance is least with the knee at its lower limit, fully bent, and largest at its upper limit,
@@ -72,7 +72,7 @@ _TINY = 1e-8
 
 
 @checks.arguments
-def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike, *, robot: Robot = NAO) -> Float[Array, "4 4"]:
+def leg_fk(joint_pos: Float[Array, "6"], side: ScalarLike, *, robot: NaoRobot = NAO) -> Float[Array, "4 4"]:
     """Return the pose of the sole in the torso frame, `T_torso_sole`.
 
     Args:
@@ -113,7 +113,7 @@ def leg_ik(
     T_torso_sole: Float[Array, "4 4"],
     side: ScalarLike,
     *,
-    robot: Robot = NAO,
+    robot: NaoRobot = NAO,
     yaw_pitch: ScalarLike | None = None,
 ) -> Float[Array, "6"]:
     """Return the joint angles for a pose of the sole in the torso frame, the inverse of `leg_fk`.
@@ -166,7 +166,7 @@ def leg_ik(
 
 
 def _solve_with_yaw_pitch(
-    T_torso_sole: Float[Array, "4 4"], side: Scalar, yaw_pitch: Scalar, robot: Robot
+    T_torso_sole: Float[Array, "4 4"], side: Scalar, yaw_pitch: Scalar, robot: NaoRobot
 ) -> Float[Array, "6"]:
     """Return the joint angles for a given hip yaw-pitch, which turns the sole in its plane.
 

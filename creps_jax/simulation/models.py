@@ -7,11 +7,11 @@ import numpy as np
 
 from creps_jax import checks
 from creps_jax.files import models_folder
-from creps_jax.robots.nao_geometry import JOINT_NAMES
-from creps_jax.robots.robot import NAO, Robot
+from creps_jax.robots.humanoid import Humanoid
+from creps_jax.robots.robot import NAO, NaoRobot, Robot
 from creps_jax.typing import Float
 
-__all__ = ["check_model", "load_nao", "model_path"]
+__all__ = ["check_model", "load_model", "load_nao", "model_path"]
 
 _TOLERANCE = 1e-3
 """Largest accepted difference of limits (rad), torques (N m) and positions (m) between model and robot."""
@@ -33,6 +33,11 @@ def load_nao(robot: Robot = NAO) -> mujoco.MjModel:
     spec.compiler.discardvisual = True
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     return spec.compile()
+
+
+def load_model(robot: Robot) -> mujoco.MjModel:
+    """Return the model in which a robot is simulated: that of a NAO's file, or that of a `Humanoid`."""
+    return robot.model if isinstance(robot, Humanoid) else load_nao(robot)
 
 
 def model_path(robot: Robot) -> Path:
@@ -63,10 +68,12 @@ def check_model(model: mujoco.MjModel, robot: Robot) -> None:
             zero pose.
     """
     names = tuple(model.joint(model.actuator(i).trnid[0]).name for i in range(model.nu))
-    if names != JOINT_NAMES:
-        raise ValueError(f"the model's actuators must drive {JOINT_NAMES} in this order, got {names}")
+    if names != robot.joint_names:
+        raise ValueError(f"the model's actuators must drive {robot.joint_names} in this order, got {names}")
     _check_limits(model, robot)
     _check_torques(model, robot)
+    if not isinstance(robot, NaoRobot):
+        return
     _check_yaw_motors(model, robot)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -75,7 +82,7 @@ def check_model(model: mujoco.MjModel, robot: Robot) -> None:
 
 
 def _check_limits(model: mujoco.MjModel, robot: Robot) -> None:
-    limits = zip(JOINT_NAMES, robot.joint_lower, robot.joint_upper, strict=True)
+    limits = zip(robot.joint_names, robot.joint_lower, robot.joint_upper, strict=True)
     for index, (name, low, high) in enumerate(limits):
         joint, actuator = model.joint(name), model.actuator(index)
         ranges = [joint.range] * int(joint.limited[0]) + [actuator.ctrlrange] * int(actuator.ctrllimited[0])
@@ -88,7 +95,7 @@ def _check_limits(model: mujoco.MjModel, robot: Robot) -> None:
 
 
 def _check_torques(model: mujoco.MjModel, robot: Robot) -> None:
-    for index, (name, torque) in enumerate(zip(JOINT_NAMES, robot.max_joint_torque, strict=True)):
+    for index, (name, torque) in enumerate(zip(robot.joint_names, robot.max_joint_torque, strict=True)):
         actuator = model.actuator(index)
         low, high = actuator.forcerange if actuator.forcelimited[0] else (-np.inf, np.inf)
         if max(abs(low + torque), abs(high - torque)) > _TOLERANCE:
@@ -98,7 +105,7 @@ def _check_torques(model: mujoco.MjModel, robot: Robot) -> None:
             )
 
 
-def _check_yaw_motors(model: mujoco.MjModel, robot: Robot) -> None:
+def _check_yaw_motors(model: mujoco.MjModel, robot: NaoRobot) -> None:
     hips = {model.joint(f"{side}_hip_yaw_pitch").id for side in ("left", "right")}
     is_joint = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & (model.eq_active0 == 1)
     pairs = zip(model.eq_obj1id[is_joint], model.eq_obj2id[is_joint], strict=True)
@@ -111,7 +118,7 @@ def _check_yaw_motors(model: mujoco.MjModel, robot: Robot) -> None:
         )
 
 
-def _check_leg_joints(data: mujoco.MjData, robot: Robot) -> None:
+def _check_leg_joints(data: mujoco.MjData, robot: NaoRobot) -> None:
     for name, position in _left_leg_joints(robot).items():
         for side, sign in (("left", 1.0), ("right", -1.0)):
             expected = position * np.array([1.0, sign, 1.0])
@@ -123,7 +130,7 @@ def _check_leg_joints(data: mujoco.MjData, robot: Robot) -> None:
                 )
 
 
-def _check_soles(model: mujoco.MjModel, data: mujoco.MjData, robot: Robot) -> None:
+def _check_soles(model: mujoco.MjModel, data: mujoco.MjData, robot: NaoRobot) -> None:
     for side in ("left", "right"):
         down = _foot_down(model, data, f"{side}_ankle_roll")
         if down is not None and abs(down - robot.geometry.foot_down) > _TOLERANCE:
@@ -144,7 +151,7 @@ def _foot_down(model: mujoco.MjModel, data: mujoco.MjData, ankle: str) -> float 
     return float(data.joint(ankle).xanchor[2] - lowest)
 
 
-def _left_leg_joints(robot: Robot) -> dict[str, Float[np.ndarray, "3"]]:
+def _left_leg_joints(robot: NaoRobot) -> dict[str, Float[np.ndarray, "3"]]:
     """Return the positions of the left leg's joints in the torso frame at the zero pose, m."""
     g = robot.geometry
     hip = np.array([g.hip_x, g.hip_y, g.hip_z])

@@ -16,6 +16,7 @@ class Servos(NamedTuple):
     Attributes:
         stiffness: Torque per position error, N m/rad.
         damping: Torque per speed error, N m s/rad.
+        joint_damping: Torque per speed with which the joint itself resists, N m s/rad.
         control_range: Lowest and highest set-points, rad.
         torque_range: Lowest and highest torques, N m.
         qpos_index: Index of each joint's position in qpos.
@@ -24,6 +25,7 @@ class Servos(NamedTuple):
 
     stiffness: Float[np.ndarray, " nu"]
     damping: Float[np.ndarray, " nu"]
+    joint_damping: Float[np.ndarray, " nu"]
     control_range: Float[np.ndarray, "2 nu"]
     torque_range: Float[np.ndarray, "2 nu"]
     qpos_index: Int[np.ndarray, " nu"]
@@ -32,7 +34,7 @@ class Servos(NamedTuple):
     @property
     def lead(self) -> Float[np.ndarray, " nu"]:
         """Time by which a set-point must lead, so that the damping does not hold back the motion, s."""
-        return self.damping / self.stiffness
+        return (self.damping + self.joint_damping) / self.stiffness
 
     def controls(
         self,
@@ -79,6 +81,7 @@ def read_servos(model: mujoco.MjModel) -> Servos:
     return Servos(
         stiffness.astype(np.float32),
         damping.astype(np.float32),
+        model.dof_damping[model.jnt_dofadr[joint]].astype(np.float32),
         control_range.astype(np.float32),
         torque_range.astype(np.float32),
         qpos_index=model.jnt_qposadr[joint],

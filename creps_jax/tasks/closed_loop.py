@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from creps_jax import checks
 from creps_jax.numerics.rotations import quat_to_matrix, quat_to_rpy, rotation_y, rpy_to_quat
-from creps_jax.robots.nao_geometry import NUM_JOINTS, NaoGeometry
 from creps_jax.robots.robot import Robot
-from creps_jax.simulation.models import check_model, load_nao
+from creps_jax.simulation.models import check_model, load_model
+from creps_jax.simulation.servos import read_servos
 from creps_jax.simulation.state import ControlStep, Physics, RobotState, initial_state
 from creps_jax.simulation.world import World, world_of
 from creps_jax.tasks.conditions import (
@@ -23,7 +24,7 @@ from creps_jax.tasks.conditions import (
     slope_angle,
     upward,
 )
-from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar, ScalarLike
+from creps_jax.typing import Array, Bool, Float, Int, IntScalar, PRNGKey, Scalar, ScalarLike
 from creps_jax.walking.controller import Walker, WalkerState
 from creps_jax.walking.engine import BodyPose
 
@@ -64,6 +65,7 @@ class WalkSetup(NamedTuple):
         conditions: The conditions that the context holds besides the speed.
         world: The world of the robot's model.
         num_velocities: Number of generalised velocities of the model.
+        joint_index: Index of each joint of the robot in the model's positions qpos.
         control_step: Simulates one control step.
     """
 
@@ -73,6 +75,7 @@ class WalkSetup(NamedTuple):
     conditions: Sequence[Condition]
     world: World
     num_velocities: int
+    joint_index: Int[np.ndarray, " nu"]
     control_step: ControlStep
 
     @property
@@ -131,10 +134,10 @@ def make_setup(
     check_numbers("noise", noise, least=0.0)
     check_conditions(conditions, duration, CONTROL_PERIOD)
     checks.function("physics", physics, "(model, number of steps) -> control step")
-    used = load_nao(robot) if model is None else model
+    used = load_model(robot) if model is None else model
     check_model(used, robot)
-    control_step = physics(used, _count_substeps(used))
-    return WalkSetup(robot, duration, noise, conditions, world_of(used), used.nv, control_step)
+    control_step, joint_index = physics(used, _count_substeps(used)), read_servos(used).qpos_index
+    return WalkSetup(robot, duration, noise, conditions, world_of(used), used.nv, joint_index, control_step)
 
 
 def check_start_up(start_up: float, duration: float) -> None:
@@ -177,13 +180,13 @@ def begin(
     circumstances = circumstances_of(setup.conditions, values, setup.world)
     slope = _slope_in(circumstances)
     standing = walker.start(slope)
-    dtype = standing.set_point.dtype
+    dtype, num_joints = standing.set_point.dtype, setup.robot.num_joints
     lean_noise = setup.noise.lean * jax.random.normal(lean_key, (setup.num_ticks, 3), dtype)
     set_point_noise = setup.noise.set_point * jax.random.normal(
-        set_point_key, (setup.num_ticks, NUM_JOINTS), dtype
+        set_point_key, (setup.num_ticks, num_joints), dtype
     )
-    set_point_noise = jnp.concatenate([jnp.zeros((1, NUM_JOINTS), dtype), set_point_noise])
-    joint_noise = setup.noise.start * jax.random.normal(start_key, (NUM_JOINTS,), dtype)
+    set_point_noise = jnp.concatenate([jnp.zeros((1, num_joints), dtype), set_point_noise])
+    joint_noise = setup.noise.start * jax.random.normal(start_key, (num_joints,), dtype)
     robot = stand(setup, walker, standing, slope, joint_noise)
     return Walk(lean_noise, set_point_noise, circumstances), WalkState(robot, standing)
 
@@ -197,9 +200,10 @@ def stand(
 ) -> RobotState:
     """Return the state of a robot that stands at rest as a walker starts, with noise on its joints, rad."""
     lean = standing.gait.params.lean + slope
-    torso = _torso_over(walker.pose(standing, slope), lean, setup.robot.geometry)
-    qpos = jnp.concatenate([torso, standing.set_point + joint_noise])
-    return initial_state(qpos, setup.num_velocities)
+    torso = _torso_over(walker.pose(standing, slope), lean, setup.robot)
+    joints = jnp.zeros(setup.robot.num_joints, torso.dtype)
+    joints = joints.at[setup.joint_index - len(torso)].set(standing.set_point + joint_noise)
+    return initial_state(jnp.concatenate([torso, joints]), setup.num_velocities)
 
 
 def advance(
@@ -256,7 +260,7 @@ def is_robot_fallen(
     setup: WalkSetup, robot: RobotState, up: Float[Array, "3"] | None = None
 ) -> Bool[Array, ""]:
     """Return the same for a robot; `up` is the vertical in the frame of the floor, by default its normal."""
-    is_high = robot.qpos[2] > _FALLEN_SHARE * setup.robot.geometry.torso_height
+    is_high = robot.qpos[2] > _FALLEN_SHARE * setup.robot.torso_height
     rotation = quat_to_matrix(robot.qpos[3:7])
     cosine = rotation[2, 2] if up is None else up @ rotation[:, 2]
     return ~(is_high & (cosine > _FALLEN_COSINE))
@@ -282,9 +286,10 @@ def _count_substeps(model: mujoco.MjModel) -> int:
     return round(ratio)
 
 
-def _torso_over(pose: BodyPose, lean: Scalar, geometry: NaoGeometry) -> Float[Array, "7"]:
+def _torso_over(pose: BodyPose, lean: Scalar, robot: Robot) -> Float[Array, "7"]:
     """Return the position (m) and quaternion of a torso that leans over the hips of a pose."""
-    hip_centre = jnp.array([geometry.hip_x, 0.0, geometry.hip_z], lean.dtype)
+    x, z = robot.hip_centre
+    hip_centre = jnp.array([x, 0.0, z], lean.dtype)
     position = pose.hips[:3] - rotation_y(lean) @ hip_centre
     zero = jnp.zeros_like(lean)
     return jnp.concatenate([position, rpy_to_quat(jnp.stack([zero, lean, zero]))])

@@ -128,7 +128,7 @@ def nao_steered_walk(
         balance: How steps answer to the measured orientation.
         conditions: The k conditions that the context holds besides the command, see `tasks.conditions`.
         robot: The robot.
-        model: Its model; by default `simulation.models.load_nao(robot)`.
+        model: Its model; by default `simulation.models.load_model(robot)`.
         physics: The simulator, see `nao_walk`.
         acceleration: See `Walker`.
         com: See `Walker`.
@@ -159,7 +159,7 @@ def nao_steered_walk(
     @checks.arguments
     def rollout(key: PRNGKey, context: Array, theta: Float[Array, "12"]) -> SteeringOutcome:
         context = checks.array("context", context, (contexts.size,))
-        gait = _gait_up_to(context[:3], steered_gait(theta))
+        gait = _gait_up_to(context[:3], steered_gait(theta, robot=robot))
         walker = Walker(gait, robot, CONTROL_PERIOD, balance, acceleration, com)
         walk, start = begin(setup, walker, key, context[3:])
         end = _walk_to_end(setup, walker, walk, start, context[:3], parts)
@@ -326,7 +326,7 @@ def record_drive(
         noise: Sizes of the noise.
         conditions: See `nao_steered_walk`.
         values: Value of each condition.
-        model: The model of the walker's robot; by default `simulation.models.load_nao(robot)`.
+        model: The model of the walker's robot; by default `simulation.models.load_model(robot)`.
         physics: The simulator, see `nao_walk`.
 
     Raises:

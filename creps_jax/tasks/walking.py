@@ -41,11 +41,17 @@ __all__ = ["WalkOutcome", "WalkRecord", "WalkReward", "nao_walk", "record_walk"]
 
 
 class WalkReward(NamedTuple):
-    """Weights of the reward, `-speed (vx - s)^2 - drift vy^2 - fall [fell]` (the paper's Eq. 18)."""
+    """Weights of the reward, `-speed (vx - s)^2 - drift vy^2 - fall [fell] (1 - upright t/T)`.
+
+    With `upright` 0, the default, it is the paper's Eq. 18. Otherwise this share of the cost of a fall is
+    given back in proportion to the time t before it, relative to the duration T of the episode, so that a
+    search in which all samples fall has a direction.
+    """
 
     speed: float = 10.0
     drift: float = 1.0
     fall: float = 100.0
+    upright: float = 0.0
 
 
 class WalkOutcome(NamedTuple):
@@ -115,6 +121,7 @@ def nao_walk(
     robot: Robot = NAO,
     model: mujoco.MjModel | None = None,
     physics: Physics = mjx.make_control_step,
+    com: str = "one_step",
 ) -> Task:
     """Make the walking task: the context is the commanded speed in m/s, theta the ten walking parameters.
 
@@ -141,9 +148,11 @@ def nao_walk(
         balance: How steps answer to the measured orientation; by default not at all, as in the paper.
         conditions: The k conditions that the context holds besides the speed, see `tasks.conditions`.
         robot: The robot.
-        model: Its model; by default `simulation.models.load_nao(robot)`.
+        model: Its model; by default `simulation.models.load_model(robot)`.
         physics: The simulator: `simulation.mjx.make_control_step`, which runs on any device, or
             `simulation.c.make_control_step`, C MuJoCo on the host.
+        com: How the CoM is planned, see `Walker`: "one_step" as in the paper, or "continuous", with which a
+            robot whose feet are narrow does not tip over in its first step.
 
     Returns:
         The task. Its rollout is for one robot; vmap it for a batch.
@@ -168,10 +177,10 @@ def nao_walk(
     @checks.arguments
     def rollout(key: PRNGKey, context: Array, theta: Float[Array, "10"]) -> WalkOutcome:
         context = checks.array("context", context, (contexts.size,))
-        walker = straight_walker(theta, robot=robot, period=CONTROL_PERIOD, balance=balance)
+        walker = straight_walker(theta, robot=robot, period=CONTROL_PERIOD, balance=balance, com=com)
         walk, start = begin(setup, walker, key, context[1:])
         end = _walk_to_end(setup, walker, walk, start, start_up_ticks)
-        return _measure(end, start_up_ticks, context[0], reward)
+        return _measure(end, start_up_ticks, setup.num_ticks, context[0], reward)
 
     # A fall at twice the highest speed in the wrong direction.
     worst = -(reward.fall + reward.speed * (3.0 * high) ** 2)
@@ -191,6 +200,7 @@ def record_walk(
     robot: Robot = NAO,
     model: mujoco.MjModel | None = None,
     physics: Physics = mjx.make_control_step,
+    com: str = "one_step",
 ) -> WalkRecord:
     """Walk as in the task of `nao_walk`, and record every control step, also those after a fall.
 
@@ -205,6 +215,7 @@ def record_walk(
         robot: See `nao_walk`.
         model: See `nao_walk`.
         physics: See `nao_walk`.
+        com: See `nao_walk`.
 
     Returns:
         The record of the walk.
@@ -216,7 +227,7 @@ def record_walk(
     setup = make_setup(robot, model, duration, noise, conditions, physics)
     values = jnp.zeros(0, theta.dtype) if values is None else values
     values = checks.array("values", values, (len(conditions),), note=", one for each of the conditions")
-    walker = straight_walker(theta, robot=robot, period=CONTROL_PERIOD, balance=balance)
+    walker = straight_walker(theta, robot=robot, period=CONTROL_PERIOD, balance=balance, com=com)
     walk, start = begin(setup, walker, key, values)
 
     def step(carry, tick):
@@ -252,12 +263,15 @@ def _walk_to_end(
     return lax.while_loop(is_walking, step, first)
 
 
-def _measure(end: _Progress, start_up_ticks: int, commanded: Scalar, reward: WalkReward) -> WalkOutcome:
+def _measure(
+    end: _Progress, start_up_ticks: int, num_ticks: int, commanded: Scalar, reward: WalkReward
+) -> WalkOutcome:
     """Return the outcome of an episode from its end and the commanded speed."""
     dtype = end.measured_from.dtype
     measured = jnp.maximum(end.tick - start_up_ticks, 1).astype(dtype) * CONTROL_PERIOD
     speed = (end.state.robot.qpos[:2] - end.measured_from) / measured
     value = -reward.speed * (speed[0] - commanded) ** 2 - reward.drift * speed[1] ** 2
-    value = value - reward.fall * end.has_fallen.astype(dtype)  # Eq. 18
+    given_back = reward.upright * end.tick.astype(dtype) / num_ticks
+    value = value - reward.fall * (1.0 - given_back) * end.has_fallen.astype(dtype)  # Eq. 18
     seconds = end.tick.astype(dtype) * CONTROL_PERIOD
     return WalkOutcome(value, jnp.zeros(0, dtype), end.has_fallen, speed, seconds)

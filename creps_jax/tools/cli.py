@@ -44,7 +44,8 @@ class Play:
     Attributes:
         speed: Speeds in m/s; by default six speeds over the range of the policy.
         policy: Policy file; by default the latest learned policy, or else the shipped one.
-        robot: Robot of the policy; by default the robot of the file, or nao.
+        robot: Robot of the policy, nao, nao_h25, or the .toml file that describes it; by default the robot
+            of the policy, or nao.
         out: The .mp4 file.
         seed: Seed of the noise; 0 by default.
     """
@@ -65,7 +66,8 @@ class Export:
             planner, kinematics and posture feedback, is written as C code (.c, and its header .h). A walk
             from standstill, without posture feedback, is written as a table (.csv) or arrays (.npz).
         policy: Policy file; by default the latest learned walking policy, or else the shipped one.
-        robot: Robot of the policy; by default the robot of the file, or nao.
+        robot: Robot of the policy, nao, nao_h25, or the .toml file that describes it; by default the robot
+            of the policy, or nao.
         speed: Speed of the walk in m/s (.csv and .npz only).
         duration: Length of the walk in s (.csv and .npz only); 8 by default.
         period: Time between two set-points in s (.c, .csv and .npz only); 0.02 by default.
@@ -87,12 +89,14 @@ class Drive:
         script: CSV file of commands, with the columns time, vx, vy, turn (s, m/s, m/s, rad/s); by default a
             window opens, and the arrow keys change the command.
         policy: Policy file; by default the shipped policy that can be steered.
+        robot: Robot of the policy, or the .toml file that describes it; by default the robot of the policy.
         video: The .mp4 file that a script makes.
         seed: Seed of the noise of a script; 0 by default.
     """
 
     script: _File = None
     policy: _File = None
+    robot: _Text = None
     video: Path = Path("results/drive.mp4")
     seed: int = 0
 
@@ -135,9 +139,10 @@ def _drive(command: Drive) -> int:
     if command.script is None:
         from creps_jax.tools.drive_live import drive_live
 
-        drive_live(policy, say=say)
+        drive_live(policy, robot=command.robot, say=say)
     else:
-        drive.drive_by_script(command.script, policy, command.video, seed=command.seed, say=say)
+        options = {"robot": command.robot, "seed": command.seed, "say": say}
+        drive.drive_by_script(command.script, policy, command.video, **options)
     return 0
 
 

@@ -15,7 +15,7 @@ from creps_jax.files import policies_folder
 from creps_jax.simulation import c
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tasks.steering import Drive, record_drive
-from creps_jax.tools.play import load_walking_policy, save_film
+from creps_jax.tools.play import load_walking_policy, robot_of, save_film
 from creps_jax.tools.video import Clip
 from creps_jax.walking.controller import Walker
 from creps_jax.walking.gaits import COMMAND_NAMES, learned_walker
@@ -73,13 +73,22 @@ def default_policy() -> Path:
     return policies_folder() / "steer.npz"
 
 
-def drive_by_script(script: Path, policy: Path, out: Path, *, seed: int, say: Callable[[str], None]) -> None:
+def drive_by_script(
+    script: Path,
+    policy: Path,
+    out: Path,
+    *,
+    robot: str | None = None,
+    seed: int,
+    say: Callable[[str], None],
+) -> None:
     """Drive a robot by the commands of a file, print what it did, and film it.
 
     Args:
         script: CSV file of commands, see `read_script`.
         policy: the policy file.
         out: the video, an .mp4 file.
+        robot: name of the robot, or the file that describes it; None is the robot of the policy.
         seed: seed of the noise.
         say: prints one line.
 
@@ -90,7 +99,7 @@ def drive_by_script(script: Path, policy: Path, out: Path, *, seed: int, say: Ca
         raise UserError(f"a video must be an .mp4 file, got {out}")
     files.check_writable(out.parent)
     commands = read_script(script)
-    walker = load_walker(policy)
+    walker = load_walker(policy, robot)
     say(f"policy: {policy}")
     drive = drive_by_commands(walker, commands, seed=seed)
     for line in report(commands, drive):
@@ -116,13 +125,14 @@ def in_words(speed: Sequence[float] | np.ndarray) -> str:
     return " ".join(f"{value + 0.0:.2f}" for value in np.round(np.asarray(speed, float), 2))
 
 
-def load_walker(policy: Path) -> Walker:
+def load_walker(policy: Path, robot: str | None = None) -> Walker:
     """Load a policy file, and make its walker.
 
     Raises:
-        UserError: if the file cannot be read, or its policy is no walk.
+        UserError: if the file cannot be read, or its policy is no walk, or of another robot.
     """
-    return learned_walker(load_walking_policy(policy, can_steer=True))
+    learned = load_walking_policy(policy, robot, can_steer=True)
+    return learned_walker(learned, robot=robot_of(learned, robot))
 
 
 def drive_by_commands(walker: Walker, commands: np.ndarray, *, seed: int) -> Drive:

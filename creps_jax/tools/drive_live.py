@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from creps_jax.errors import UserError
+from creps_jax.robots.humanoid import Humanoid
 from creps_jax.simulation import c
 from creps_jax.simulation.models import model_path
 from creps_jax.tasks.closed_loop import (
@@ -25,7 +26,7 @@ from creps_jax.tasks.closed_loop import (
 )
 from creps_jax.tasks.steering import moved
 from creps_jax.tools.drive import AVERAGED, in_words
-from creps_jax.tools.play import load_walking_policy
+from creps_jax.tools.play import load_walking_policy, robot_of
 from creps_jax.walking.controller import Walker
 from creps_jax.walking.gaits import command_range, learned_walker
 
@@ -55,18 +56,20 @@ _KEYS = {265: (0, 1), 264: (0, -1), 44: (1, 1), 46: (1, -1), 263: (2, 1), 262: (
 _HELP = "up, down: forward speed\nleft, right: turn\ncomma, full stop: sideways\nspace: stop"
 
 
-def drive_live(policy: Path, *, say: Callable[[str], None]) -> None:
+def drive_live(policy: Path, *, robot: str | None = None, say: Callable[[str], None]) -> None:
     """Open MuJoCo's viewer and drive a robot with the arrow keys, until the window is closed.
 
     Args:
         policy: the policy file.
+        robot: name of the robot, or the file that describes it; None is the robot of the policy.
         say: prints one line.
 
     Raises:
         UserError: if the policy cannot be driven, or there is no screen.
     """
-    learned = load_walking_policy(policy, can_steer=True)
-    walker = learned_walker(learned)
+    learned = load_walking_policy(policy, robot, can_steer=True)
+    who = robot_of(learned, robot)
+    walker = learned_walker(learned, robot=who)
     say(f"policy: {policy}")
     if sys.platform.startswith("linux") and not (
         os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
@@ -76,19 +79,20 @@ def drive_live(policy: Path, *, say: Callable[[str], None]) -> None:
         )
     import mujoco.viewer
 
-    model = mujoco.MjModel.from_xml_path(str(model_path(walker.robot)))
+    is_read = isinstance(who, Humanoid)
+    model = who.film_model if is_read else mujoco.MjModel.from_xml_path(str(model_path(who)))
     data = mujoco.MjData(model)
     command, live = Command(*command_range(learned)), LiveRobot(walker)
     with mujoco.viewer.launch_passive(
         model, data, key_callback=command.press, show_left_ui=False, show_right_ui=False
     ) as viewer:
-        viewer.cam.distance, viewer.cam.elevation, viewer.cam.azimuth = 1.6, -15.0, 135.0
+        viewer.cam.distance, viewer.cam.elevation, viewer.cam.azimuth = 1.6 * who.size, -15.0, 135.0
         next_at = time.monotonic()
         while viewer.is_running():
             qpos, reached = live.step(command.value)
             data.qpos[:] = qpos
             mujoco.mj_forward(model, data)
-            viewer.cam.lookat[:] = (*qpos[:2], 0.25)
+            viewer.cam.lookat[:] = (*qpos[:2], 0.25 * who.size)
             fell = "\nfell: starts again" if live.has_fallen else ""
             text = f"{in_words(command.value)}\n{in_words(reached)}{fell}"
             viewer.set_texts(

@@ -1,17 +1,20 @@
 """Record, show and film walks of a policy."""
 
 import math
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 
 from creps_jax import files
 from creps_jax.errors import UserError
 from creps_jax.files import policies_folder
 from creps_jax.policies.learned import Learned, load
+from creps_jax.robots.humanoid import Humanoid
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.simulation import c
 from creps_jax.simulation.models import model_path
@@ -19,7 +22,7 @@ from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tasks.conditions import slope
 from creps_jax.tasks.walking import record_walk
 from creps_jax.tools import results
-from creps_jax.tools.robots import find_robot
+from creps_jax.tools.robots import ROBOTS, find_robot, is_spec, robot_id
 from creps_jax.tools.video import Clip, VideoError, write_video
 from creps_jax.walking.params import PARAM_NAMES, STEERED_PARAM_NAMES
 from creps_jax.walking.posture import Balance
@@ -44,7 +47,8 @@ def show(
     Args:
         speeds: asked speeds, m/s; if empty, six speeds over the range of the policy.
         path: policy file; None is the latest learned policy of the robot, or else the shipped one.
-        robot: name of the robot; None is the robot of the file, or without a file the NAO.
+        robot: name of the robot, or the file that describes it; None is the robot of the policy, or without a
+            policy the NAO.
         out: the video, an .mp4 file.
         seed: seed of the noise.
         say: prints one line.
@@ -67,10 +71,11 @@ def show(
         space = policy.parameters
         for name, unit, value in zip(space.names, space.units, thetas[0], strict=True):
             say(f"  {name.replace('_', ' '):16}{value:8.4f} {unit}".rstrip())
-    clips = record(policy, speeds, seed=seed)
+    who = robot_of(policy, robot)
+    clips = record(policy, speeds, seed=seed, robot=who)
     for clip in clips:
         say(str(clip.caption))
-    save_film(clips, out, say, robot=robot_of(policy))
+    save_film(clips, out, say, robot=who)
 
 
 def filmed_speeds(policy: Learned) -> list[float]:
@@ -84,6 +89,7 @@ def record(
     speeds: Sequence[float],
     *,
     seed: int,
+    robot: Robot,
     duration: float = 8.0,
     slopes: Sequence[float] | None = None,
 ) -> list[Clip]:
@@ -93,6 +99,7 @@ def record(
         policy: a policy of which the context is speed, or speed and slope.
         speeds: asked speeds, m/s.
         seed: seed of the noise.
+        robot: the robot of the policy.
         duration: length of the walks, s.
         slopes: slope of each walk, deg, for a policy with a slope in its context.
 
@@ -107,7 +114,7 @@ def record(
     )
     # MJX would take longer to compile than a few walks take in C MuJoCo.
     settings = {"duration": duration, "balance": balance_of(policy), "physics": c.make_control_step}
-    settings["robot"] = robot_of(policy)
+    settings |= {"robot": robot, "com": policy.task.get("com", "one_step")}
     if slopes is not None:
         settings["conditions"] = (slope(policy.contexts.low[1], policy.contexts.high[1]),)
     walk = jax.jit(jax.vmap(lambda key, theta, way: record_walk(key, theta, values=way, **settings)))
@@ -129,22 +136,33 @@ def save_film(clips: Sequence[Clip], path: Path, say: Callable[[str], None], *, 
     """Write a video, or print why it cannot be made: a result is complete without it."""
     try:
         middle = len(clips[0].qpos) * clips[0].period / 2
-        write_video(path, model_path(robot), clips, still_at=middle)
+        with tempfile.TemporaryDirectory(prefix="creps_jax-") as folder:
+            model = _film_model(robot, Path(folder))
+            write_video(path, model, clips, still_at=middle, size=robot.size)
         say(f"video: {path}")
     except VideoError as error:
         say(str(error))
+
+
+def _film_model(robot: Robot, folder: Path) -> Path:
+    """Return the file of the model with which a robot is drawn; a humanoid's is written into a folder."""
+    if not isinstance(robot, Humanoid):
+        return model_path(robot)
+    mujoco.mj_saveModel(robot.film_model, str(folder / "model.mjb"), None)
+    return folder / "model.mjb"
 
 
 def default_policy(robot: str | None = None) -> Path:
     """Return the policy of a robot's latest finished run, or else its shipped policy.
 
     Args:
-        robot: name of the robot; None is the NAO.
+        robot: name of the robot, or the file that describes it; None is the NAO.
 
     Raises:
         UserError: if there is neither, or the robot is unknown.
     """
-    robot = find_robot(robot or NAO.name).robot.name
+    robot = robot_id(robot or NAO.name)
+    find_robot(robot)
     folder = results.latest_folder("walk", status="finished", robot=robot)
     if folder is not None and (folder / POLICY).exists():
         return folder / POLICY
@@ -157,9 +175,10 @@ def shipped_policy(robot: str | None = None) -> Path:
     Raises:
         UserError: if there is none, or the robot is unknown.
     """
-    robot = find_robot(robot or NAO.name).robot.name
+    robot = robot or NAO.name
+    find_robot(robot)
     shipped = policies_folder(robot) / "walk.npz"
-    if not shipped.exists():
+    if is_spec(robot) or not shipped.exists():
         asked = "" if robot == NAO.name else f" --robot {robot}"
         raise UserError(
             f"no policy has been learned yet: python -m experiments run walk{asked} --preset quick"
@@ -172,7 +191,7 @@ def load_walking_policy(path: Path, robot: str | None = None, *, can_steer: bool
 
     Args:
         path: the file.
-        robot: name of the robot that the policy must have; None accepts any.
+        robot: name of the robot that the policy must have, or the file that describes it; None accepts any.
         can_steer: whether a policy of a steered walk is accepted as well.
 
     Raises:
@@ -191,21 +210,35 @@ def load_walking_policy(path: Path, robot: str | None = None, *, can_steer: bool
         wanted = ", ".join(Balance._fields)
         raise UserError(f"{path} must have the balance of its steps, {wanted}, got {policy.task}")
     try:
-        found = robot_of(policy).name
+        robot_of(policy, robot)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    if robot is not None and find_robot(robot).robot.name != found:
-        raise UserError(f"{path} is a policy of the robot {found}, not of {robot}")
     return policy
 
 
-def robot_of(policy: Learned) -> Robot:
+def robot_of(policy: Learned, robot: str | None = None) -> Robot:
     """Return the robot that a policy was learned with; older files do not name it, and are the NAO's.
 
+    Args:
+        policy: the policy.
+        robot: name of the robot that the policy must have, or the file that describes it; None is the robot
+            that the policy names.
+
     Raises:
-        UserError: if it is unknown.
+        UserError: if it is unknown or another one.
     """
-    return find_robot(str(policy.task.get("robot", NAO.name))).robot
+    name, spec = str(policy.task.get("robot", NAO.name)), str(policy.task.get("spec", ""))
+    if robot is None:
+        if name not in ROBOTS and not (is_spec(spec) and Path(spec).is_file()):
+            raise UserError(
+                f"the policy is of the robot {name!r}, described by {spec or 'no file'}, which is not there: "
+                "name its file with --robot"
+            )
+        robot = name if name in ROBOTS else spec
+    found = find_robot(robot).robot
+    if found.name != name:
+        raise UserError(f"the policy is of the robot {name}, not of {found.name}")
+    return found
 
 
 def balance_of(policy: Learned) -> Balance:

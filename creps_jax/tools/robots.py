@@ -1,14 +1,20 @@
-"""The robots that the commands know, by name, each with the ranges in which it learns to walk."""
+"""The robots that the commands know: by name, or by a TOML file that describes them."""
 
+import functools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import NamedTuple
 
 from creps_jax.errors import UserError, suggest
 from creps_jax.robots import robot as robots
+from creps_jax.robots.humanoid import Humanoid
 from creps_jax.robots.robot import NAO, NAO_H25, Robot
-from creps_jax.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS
+from creps_jax.robots.spec import humanoid_from_toml
+from creps_jax.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS, Bounds, humanoid_bounds
 
-Bounds = tuple[tuple[float, ...], tuple[float, ...]]
+__all__ = ["ROBOTS", "Bounds", "RobotRanges", "find_robot", "is_spec", "robot_id"]
+
+SPEC_SUFFIX = ".toml"
 
 
 class RobotRanges(NamedTuple):
@@ -33,12 +39,34 @@ ROBOTS: Mapping[str, RobotRanges] = {
 }
 
 
+def is_spec(name: str) -> bool:
+    """Return whether a robot is named by the file that describes it."""
+    return name.endswith(SPEC_SUFFIX)
+
+
+def robot_id(name: str) -> str:
+    """Return what identifies a robot in settings and results: its name, or the full path of its file."""
+    return str(Path(name).resolve()) if is_spec(name) else name
+
+
 def find_robot(name: str) -> RobotRanges:
-    """Return a robot and its ranges by the robot's name.
+    """Return a robot and its ranges by the robot's name, or by the TOML file that describes it.
 
     Raises:
-        UserError: with the nearest name and all known names, if the name is unknown.
+        UserError: with the nearest name and all known names, if the name is unknown, or if the file does not
+            describe a robot.
     """
+    if is_spec(name):
+        return _read_spec(robot_id(name))
     if name not in ROBOTS:
-        raise UserError(f"unknown robot {name!r}{suggest(name, ROBOTS)}")
+        raise UserError(f"unknown robot {name!r}{suggest(name, ROBOTS)}, or name a {SPEC_SUFFIX} file")
     return ROBOTS[name]
+
+
+@functools.lru_cache(maxsize=16)
+def _read_spec(path: str) -> RobotRanges:
+    """Read a file once in a process."""
+    robot: Humanoid = humanoid_from_toml(path)
+    if robot.name in ROBOTS:
+        raise UserError(f"{path} must give its robot a name of its own, got {robot.name!r}")
+    return RobotRanges(robot, *robot.speeds, humanoid_bounds(robot))

@@ -45,15 +45,18 @@ class VideoError(UserError):
     """A video cannot be made; the message has the reason, and what may help."""
 
 
-def write_video(path: Path, model: Path, clips: Sequence[Clip], *, still_at: float | None = None) -> None:
+def write_video(
+    path: Path, model: Path, clips: Sequence[Clip], *, still_at: float | None = None, size: float = 1.0
+) -> None:
     """Film walks side by side, each with a camera that follows the robot.
 
     Args:
         path: the .mp4 file, written atomically.
-        model: the MJCF file of the robot.
+        model: the MJCF file of the robot, or its compiled model, an .mjb file.
         clips: the walks; a shorter one stops at its last frame.
         still_at: time in seconds of a frame in better quality, written next to the video as .png; None writes
             none.
+        size: length of a leg relative to that of the NAO, which decides on the distance of the camera.
 
     Raises:
         VideoError: if rendering fails, for example without OpenGL.
@@ -66,7 +69,7 @@ def write_video(path: Path, model: Path, clips: Sequence[Clip], *, still_at: flo
         environment.setdefault("MUJOCO_GL", "egl")
     with tempfile.TemporaryDirectory(prefix="creps_jax-") as folder:
         job, video, still = (Path(folder) / name for name in ("job.npz", "video.mp4", "still.png"))
-        save_arrays(job, _job(model, clips, -1.0 if still_at is None else still_at))
+        save_arrays(job, _job(model, clips, -1.0 if still_at is None else still_at) | {"size": size})
         command = [sys.executable, "-m", "creps_jax.tools.video", str(job), str(video), str(still)]
         try:
             done = subprocess.run(
@@ -120,7 +123,9 @@ def _render_job(job: Path, video: Path, still: Path) -> None:
         for index, (period, slope) in enumerate(zip(arrays["periods"], arrays["slopes"], strict=True))
     ]
     columns, rows = layout(len(clips))
-    model = mujoco.MjModel.from_xml_path(str(arrays["model"]))
+    is_compiled = str(arrays["model"]).endswith(".mjb")
+    load = mujoco.MjModel.from_binary_path if is_compiled else mujoco.MjModel.from_xml_path
+    model, scale = load(str(arrays["model"])), float(arrays["size"])
     size = (columns * CELL_SIZE[0], rows * CELL_SIZE[1])
     writer = imageio_ffmpeg.write_frames(
         str(video), size, fps=FPS, codec="libx264", quality=None, macro_block_size=2,
@@ -128,16 +133,22 @@ def _render_job(job: Path, video: Path, still: Path) -> None:
     )  # fmt: skip
     writer.send(None)
     with contextlib.closing(writer):
-        for frame in _frames(model, clips, scale=1):
+        for frame in _frames(model, clips, scale=1, robot_size=scale):
             writer.send(np.ascontiguousarray(frame))
     still_at = float(arrays["still_at"])
     if still_at >= 0:
-        (frame,) = _frames(model, clips, scale=2, fine=True, at=still_at)
+        (frame,) = _frames(model, clips, scale=2, robot_size=scale, fine=True, at=still_at)
         Image.fromarray(frame).save(still, optimize=True)
 
 
 def _frames(
-    model, clips: Sequence[Clip], *, scale: int, fine: bool = False, at: float | None = None
+    model,
+    clips: Sequence[Clip],
+    *,
+    scale: int,
+    robot_size: float,
+    fine: bool = False,
+    at: float | None = None,
 ) -> Iterator[np.ndarray]:
     """Yield the frames of a video, or the frame at a time: a grid of cells, one for each clip.
 
@@ -145,6 +156,7 @@ def _frames(
         model: the compiled robot.
         clips: the walks.
         scale: size of a cell, as a factor of CELL_SIZE.
+        robot_size: size of the robot relative to the NAO.
         fine: whether to draw shadows and smooth edges; otherwise cells are drawn at twice their size
             and averaged, which is three times as fast without a graphics card.
         at: time of the only frame, s; None is all frames.
@@ -159,7 +171,7 @@ def _frames(
     model.vis.quality.offsamples = 4 if fine else 0
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
-    camera.azimuth, camera.elevation, camera.distance = 125.0, -12.0, 1.1
+    camera.azimuth, camera.elevation, camera.distance = 125.0, -12.0, 1.1 * robot_size
     seconds = max(len(clip.qpos) * clip.period for clip in clips)
     times = [at] if at is not None else np.arange(max(1, math.floor(seconds * FPS))) / FPS
     paths = [_smooth(clip.qpos[:, :2], round(0.6 / clip.period)) for clip in clips]
@@ -173,7 +185,7 @@ def _frames(
                 data.qpos[:] = clip.qpos[index]
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_camlight(model, data)
-                camera.lookat[:] = _tilt(data, clip.slope) @ (*path[index], 0.26)
+                camera.lookat[:] = _tilt(data, clip.slope) @ (*path[index], 0.26 * robot_size)
                 renderer.update_scene(data, camera)
                 image = Image.fromarray(renderer.render()).reduce(factor)
                 row, column = divmod(cell, columns)

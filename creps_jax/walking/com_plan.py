@@ -21,7 +21,8 @@ __all__ = ["NUM_NODES", "ComPlan", "com_heights", "plan_com", "plan_continuous_c
 
 NUM_NODES = 33
 """Number of equally spaced nodes at which a step is planned."""
-# Largest shift of the ZMP in the feet that keeps the velocity of the CoM continuous, m (forward, sideways).
+# Largest shift of the ZMP in the feet that keeps the velocity of the CoM continuous, m (forward, sideways),
+# for a NAO; it scales with the leg.
 LARGEST_SHIFT = (0.04, 0.02)
 
 
@@ -99,7 +100,7 @@ def plan_continuous_com(
     heights = com_heights(params, robot=robot)
     solve = jax.vmap(continuous_com_trajectory, in_axes=(1, None, None, None, 1, 1, None, 0), out_axes=1)
     zmp = shares @ jnp.stack([start, support, end[0]])
-    largest = jnp.asarray(LARGEST_SHIFT, zmp.dtype)
+    largest = robot.size * jnp.asarray(LARGEST_SHIFT, zmp.dtype)
     com, shifted = solve(zmp, shares[:, 1], *heights, before, end, duration, largest)
     return ComPlan(com, _end_velocities(com, shifted, heights, duration))
 
@@ -108,7 +109,7 @@ def com_heights(params: WalkParams, *, robot: Robot = NAO) -> tuple[Float[Array,
     """Return height (m) and vertical acceleration (m/s^2) of the CoM at the nodes of a step."""
     phase = _node_phases(params)
     height, height_acc = spring_height(phase, params.hip_height, params.amplitude, params.step_duration)
-    return height + (robot.geometry.ankle_height + robot.com_above_hip), height_acc
+    return height + (robot.ankle_height + robot.com_above_hip), height_acc
 
 
 def _end_velocities(com: Array, zmp: Array, heights: tuple[Array, Array], duration: Scalar) -> Array:

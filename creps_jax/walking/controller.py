@@ -90,7 +90,7 @@ class WalkerState(NamedTuple):
     after: Stance
     com_velocity: Float[Array, "2"]
     tilt: Tilt
-    set_point: Float[Array, "22"]
+    set_point: Float[Array, " nu"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +159,7 @@ class Walker:
             tilt=Tilt(zero[:2].at[1].set(gait.params.lean + slope), zero[:2]),
             set_point=jnp.zeros(len(self.robot.joint_lower), zero.dtype),
         )
-        return state._replace(set_point=self._joints(state, zero[0], slope))
+        return state._replace(set_point=self._joints(state, None, zero[0], slope))
 
     @checks.arguments
     def step(
@@ -168,7 +168,7 @@ class Walker:
         command: Float[Array, "3"],
         measured_rpy: Float[Array, "3"],
         slope: ScalarLike = 0.0,
-    ) -> tuple[WalkerState, Float[Array, "22"]]:
+    ) -> tuple[WalkerState, Float[Array, " nu"]]:
         """Walk on by one control period.
 
         Args:
@@ -179,7 +179,7 @@ class Walker:
 
         Returns:
             The new state, and the set-points of the joints at the end of the period, in the order of
-            `nao_geometry.JOINT_NAMES`, rad.
+            `robot.joint_names`, rad.
 
         Raises:
             ValueError: If an array has another shape, or the command or orientation is not finite.
@@ -192,7 +192,7 @@ class Walker:
         state = jax.tree.map(lambda new, old: jnp.where(is_over, new, old), begun, state)
         tilt = next_tilt(state.tilt, measured_rpy[:2], self.period, self.balance.filter_time)
         state = state._replace(time=time, command=command, tilt=tilt)
-        target = self._joints(state, measured_rpy[2], slope)
+        target = self._joints(state, state.set_point, measured_rpy[2], slope)
         set_point = next_set_point(state.set_point, target, self.period, robot=self.robot)
         return state._replace(set_point=set_point), set_point
 
@@ -225,14 +225,15 @@ class Walker:
         waiting = jnp.where(is_standing, 0.0, time)
         return jnp.where(is_over, after, waiting), is_over
 
-    def _joints(self, state: WalkerState, measured_yaw: Scalar, slope: ScalarLike) -> Float[Array, "22"]:
+    def _joints(
+        self, state: WalkerState, last: Array | None, measured_yaw: Scalar, slope: ScalarLike
+    ) -> Float[Array, " nu"]:
         """Return the joint targets of a state, for its tilt and the measured yaw of the trunk."""
         orientation = jnp.append(state.tilt.angle, wrapped(measured_yaw - state.origin[2]))
         pose = self._pose_in_step(state, slope)
         vertical = vertical_trunk(slope, state.origin[2] + pose.hips[3])
-        return pose_joints(
-            state.gait.params, pose, orientation, vertical=vertical, balance=self.balance, robot=self.robot
-        )
+        settings = {"vertical": vertical, "balance": self.balance, "robot": self.robot}
+        return pose_joints(state.gait.params, pose, orientation, last=last, **settings)
 
     def _begin_step(self, state: WalkerState, command: Array, measured_yaw: Scalar) -> WalkerState:
         """Plan the next step, in the frame of the body at its start."""

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from creps_jax import checks
 from creps_jax.numerics.curves import smooth_step
 from creps_jax.numerics.rotations import rigid_transform, rotation_x, rotation_y, rotation_z, wrapped
-from creps_jax.robots.nao_geometry import LEFT, RIGHT, leg_indices
-from creps_jax.robots.nao_kinematics import leg_ik
+from creps_jax.robots.legs import solve_legs
 from creps_jax.robots.robot import NAO, Robot
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 from creps_jax.walking.com import spring_height
@@ -27,13 +26,6 @@ __all__ = [
     "vertical_trunk",
 ]
 
-# Swing of the shoulders against the legs, rad for each metre that the other foot is ahead, and the arms'
-# posture, rad.
-ARM_SWING = 5.0
-SHOULDER_PITCH = -1.6
-SHOULDER_YAW = 0.1
-ARM_ROLL = 1.57
-ELBOW = 0.6
 MAX_HEADING_STEP = 0.15
 # Sideways tilt beyond which a foot is put out no further, rad.
 MAX_TILT = 0.35
@@ -104,7 +96,7 @@ def body_pose(params: WalkParams, plan: StepPlan, phase: Scalar, *, robot: Robot
     hips = com - robot.com_ahead_of_hip * forward
     supports_left = plan.footstep.supports_left
     return BodyPose(
-        hips=jnp.concatenate([hips, jnp.stack([height + robot.geometry.ankle_height, yaw])]),
+        hips=jnp.concatenate([hips, jnp.stack([height + robot.ankle_height, yaw])]),
         left=jnp.where(supports_left, support, swing),
         right=jnp.where(supports_left, swing, support),
         turn=jnp.where(supports_left, 0.5 - swung, swung - 0.5),
@@ -150,10 +142,11 @@ def pose_joints(
     pose: BodyPose,
     measured_rpy: Float[Array, "3"],
     *,
+    last: Float[Array, " nu"] | None = None,
     vertical: Float[Array, "2"] | None = None,
     balance: Balance = Balance(),
     robot: Robot = NAO,
-) -> Float[Array, "22"]:
+) -> Float[Array, " nu"]:
     """Pose the joints for a body pose and the measured orientation of the trunk.
 
     Args:
@@ -161,12 +154,14 @@ def pose_joints(
         pose: Where hips and feet shall be.
         measured_rpy: Measured roll, pitch and yaw of the trunk, rad; the yaw relative to the planned
             heading's origin.
+        last: Joint targets one control period before, rad, from which the inverse kinematics of a `Humanoid`
+            start; None starts from the posture of standing.
         vertical: Roll and pitch of a vertical trunk, rad; zero by default, see `vertical_trunk`.
         balance: How steps answer to the measured orientation.
         robot: Who walks.
 
     Returns:
-        Joint targets in the order of `nao_geometry.JOINT_NAMES`, rad, within the joint limits.
+        Joint targets in the order of `robot.joint_names`, rad, within the joint limits.
 
     Raises:
         ValueError: If the measured orientation is not finite.
@@ -182,49 +177,30 @@ def pose_joints(
     tilt = jnp.clip(measured_rpy[0] - vertical[0], -MAX_TILT, MAX_TILT)
     aside = -balance.placement_gain * params.hip_height * tilt
     aside_left, aside_right = aside * (0.5 + pose.turn), aside * (0.5 - pose.turn)
-    place = partial(_sole_in_torso, pose.hips, R_level_trunk=R_level_trunk, geometry=robot.geometry)
-    left, right = _pose_legs(
-        place(pose.left, turn=turn, aside=aside_left), place(pose.right, turn=-turn, aside=aside_right), robot
-    )
+    place = partial(_sole_in_torso, pose.hips, R_level_trunk=R_level_trunk, robot=robot)
+    T_torso_left = place(pose.left, turn=turn, aside=aside_left)
+    T_torso_right = place(pose.right, turn=-turn, aside=aside_right)
+    left, right = solve_legs(T_torso_left, T_torso_right, last, robot=robot)
     ahead = jnp.cos(pose.hips[3]) * (pose.left[0] - pose.right[0]) + jnp.sin(pose.hips[3]) * (
         pose.left[1] - pose.right[1]
     )
-    targets = jnp.concatenate([_head_and_arms(0.5 * ahead), left, right])
+    posture, arm_swing = (jnp.asarray(angles, ahead.dtype) for angles in (robot.posture, robot.arm_swing))
+    # Each arm swings against the foot of its side.
+    targets = posture + arm_swing * (0.5 * ahead)
+    targets = targets.at[jnp.array(robot.left_leg)].set(left).at[jnp.array(robot.right_leg)].set(right)
     limits = (jnp.asarray(limit, targets.dtype) for limit in (robot.joint_lower, robot.joint_upper))
     return jnp.clip(targets, *limits)
 
 
-def _pose_legs(T_torso_left, T_torso_right, robot):
-    """Return the joint angles of both legs; where they share a motor, each gives half of the way."""
-    left, right = leg_ik(T_torso_left, LEFT, robot=robot), leg_ik(T_torso_right, RIGHT, robot=robot)
-    if not robot.has_one_yaw_motor:
-        return left, right
-    yaws = [leg_indices(side).start for side in (LEFT, RIGHT)]
-    low, high = max(robot.joint_lower[i] for i in yaws), min(robot.joint_upper[i] for i in yaws)
-    # Within what the joint can do: clipped after `leg_ik`, it would take the soles from their places.
-    shared = jnp.clip(0.5 * (left[0] + right[0]), low, high)
-    return (
-        leg_ik(T_torso_left, LEFT, robot=robot, yaw_pitch=shared),
-        leg_ik(T_torso_right, RIGHT, robot=robot, yaw_pitch=shared),
-    )
-
-
-def _sole_in_torso(hips, sole, *, R_level_trunk, turn, aside, geometry):
+def _sole_in_torso(hips, sole, *, R_level_trunk, turn, aside, robot):
     """Transform a sole from the world into the frame of a trunk that leans about the middle of its hips.
 
     The sole is turned by `turn` about the hips and put `aside` to the left.
     """
     R_trunk_level = R_level_trunk.T
     R_heading = rotation_z(turn - hips[3])
-    hip_centre = jnp.array([geometry.hip_x, 0.0, geometry.hip_z], hips.dtype)
+    x, z = robot.hip_centre
+    hip_centre = jnp.array([x, 0.0, z], hips.dtype)
     from_hips = R_heading @ (sole[:3] - hips[:3]) + aside * jnp.array([0.0, 1.0, 0.0], hips.dtype)
     position = R_trunk_level @ from_hips + hip_centre
     return rigid_transform(R_trunk_level @ R_heading @ rotation_z(sole[3]), position)
-
-
-def _head_and_arms(left_foot_ahead):
-    """Hold the head still and swing each arm against the foot of its side."""
-    swing = ARM_SWING * left_foot_ahead
-    left = [SHOULDER_PITCH - swing, SHOULDER_YAW, -ARM_ROLL, -ELBOW]
-    right = [SHOULDER_PITCH + swing, -SHOULDER_YAW, ARM_ROLL, ELBOW]
-    return jnp.stack([jnp.asarray(angle, left_foot_ahead.dtype) for angle in [0.0, 0.0, *left, *right]])

@@ -15,7 +15,8 @@ FOOT_SPACING = NAO.foot_spacing
 """Distance of the two feet of the simulated NAO when standing, m."""
 
 # Where the swing foot may land, seen from where it stands beside the support foot: forward, sideways on its
-# own side (reach and collision), turned; m and rad. The body stays within half of that box.
+# own side (reach and collision), turned; m and rad, for a NAO. Lengths scale with the leg. The body stays
+# within half of that box.
 LANDING_LOW = (-0.20, -0.01, -0.6)
 LANDING_HIGH = (0.20, 0.07, 0.6)
 # The swing foot aims at the pose of the body one and a half steps ahead: after one, the body is between
@@ -81,10 +82,10 @@ def _towards(step, wanted, growth: Scalar, spacing: float):
     return shrunk + jnp.clip(wanted - shrunk, -limit, limit)
 
 
-def _limit(seen, swing_side, share, spacing):
+def _limit(seen, swing_side, share, robot):
     """Limit a pose, seen from the support foot, to a share of the box in which the swing foot may land."""
     low, high = (
-        share * jnp.array([ahead, spacing + aside, turned], seen.dtype)
+        share * jnp.array([robot.size * ahead, robot.foot_spacing + robot.size * aside, turned], seen.dtype)
         for ahead, aside, turned in (LANDING_LOW, LANDING_HIGH)
     )
     mirror = jnp.ones_like(seen).at[1].set(swing_side)
@@ -120,9 +121,9 @@ def next_footstep(
 
     sideways = jnp.zeros_like(step).at[1].set(0.5 * spacing * swing_side)
     aim = compose(compose(stance.body, SWING_AHEAD * step), sideways)
-    swing_end = compose(support, _limit(relative_pose(support, aim), swing_side, 1.0, spacing))
+    swing_end = compose(support, _limit(relative_pose(support, aim), swing_side, 1.0, robot))
     ahead = compose(stance.body, step)
-    body = compose(support, _limit(relative_pose(support, ahead), swing_side, 0.5, spacing))
+    body = compose(support, _limit(relative_pose(support, ahead), swing_side, 0.5, robot))
     after = Stance(
         body=body,
         left=jnp.where(stance.supports_left, stance.left, swing_end),

@@ -8,7 +8,7 @@ import numpy as np
 
 from creps_jax import checks
 from creps_jax.policies.learned import Learned
-from creps_jax.robots.robot import NAO, ROBOTS
+from creps_jax.robots.robot import NAO, ROBOTS, Robot
 from creps_jax.typing import Array, Float
 from creps_jax.walking.controller import Gait, Walker
 from creps_jax.walking.params import PARAM_NAMES, params_from_theta
@@ -34,16 +34,16 @@ COMMAND_UNITS = ("m/s", "m/s", "rad/s")
 """Their units."""
 AHEAD = (1.0, 0.0, 0.0)
 """Command of a `straight_walker` that is to walk: its parameters, not the command, say how fast."""
-# What steps sideways (m) and turns (rad) are limited to, whatever theta says.
+# What steps sideways (m, for a NAO) and turns (rad) are limited to, whatever theta says.
 LARGEST_SIDE, LARGEST_TURN = 0.2, 1.0
 # Acceleration of a command that is followed at once.
 _AT_ONCE = (1e6, 1e6, 1e6)
 
 
 @checks.arguments
-def straight_gait(theta: Float[Array, "10"]) -> Gait:
+def straight_gait(theta: Float[Array, "10"], *, robot: Robot = NAO) -> Gait:
     """Return the gait of the ten parameters, straight ahead."""
-    params = params_from_theta(theta)
+    params = params_from_theta(theta, robot=robot)
     zero = jnp.zeros_like(params.step_length)
     return Gait(params, jnp.stack([params.step_length, zero, zero]))
 
@@ -63,14 +63,15 @@ def straight_walker(theta: Float[Array, "10"], **settings: Any) -> Walker:
         ValueError: If theta has not one entry for each parameter, or a setting is out of its range.
     """
     once: dict[str, Any] = {"acceleration": _AT_ONCE, "com": "one_step"}
-    return Walker(lambda _: straight_gait(theta), **(once | settings))
+    robot = settings.get("robot", NAO)
+    return Walker(lambda _: straight_gait(theta, robot=robot), **(once | settings))
 
 
 @checks.arguments
-def steered_gait(theta: Float[Array, "12"]) -> Gait:
+def steered_gait(theta: Float[Array, "12"], *, robot: Robot = NAO) -> Gait:
     """Return the gait of the ten parameters and a step's displacement to the left (m) and turn (rad)."""
-    params = params_from_theta(theta[: len(PARAM_NAMES)])
-    side = jnp.clip(theta[len(PARAM_NAMES)], -LARGEST_SIDE, LARGEST_SIDE)
+    params = params_from_theta(theta[: len(PARAM_NAMES)], robot=robot)
+    side = jnp.clip(theta[len(PARAM_NAMES)], -robot.size * LARGEST_SIDE, robot.size * LARGEST_SIDE)
     turn = jnp.clip(theta[len(PARAM_NAMES) + 1], -LARGEST_TURN, LARGEST_TURN)
     return Gait(params, jnp.stack([params.step_length, side, turn]))
 
@@ -95,7 +96,8 @@ def learned_walker(learned: Learned, **settings: Any) -> Walker:
     Args:
         learned: A policy of `nao_walk` or `nao_steered_walk`. Conditions, such as a slope, are taken as zero,
             or as the end of their range next to zero.
-        settings: Settings of `Walker`, such as `period`; the others are those of learning.
+        settings: Settings of `Walker`, such as `period`; the others are those of learning. A policy of a
+            `Humanoid` needs it as `robot`.
 
     Raises:
         ValueError: If the policy is of another task, or a setting is out of its range.
@@ -105,12 +107,18 @@ def learned_walker(learned: Learned, **settings: Any) -> Walker:
     if names[:1] != ("speed",) and not is_steered(learned):
         expected = f"speed, or {', '.join(COMMAND_NAMES)}"
         raise ValueError(f"learned must be a walk whose contexts are {expected}, got {', '.join(names)}")
-    robot = task.get("robot", NAO.name)
-    if robot not in ROBOTS:
-        raise ValueError(f"the robot of learned must be one of {', '.join(ROBOTS)}, got {robot!r}")
-    gait = _command_gait(learned) if is_steered(learned) else _speed_gait(learned)
+    name, robot = task.get("robot", NAO.name), settings.get("robot")
+    if robot is None and name not in ROBOTS:
+        raise ValueError(
+            f"robot must be the Robot {name!r} with which learned was learned: make it by "
+            f"humanoid_from_mjcf; the library has {', '.join(ROBOTS)}, got no robot"
+        )
+    robot = ROBOTS[name] if robot is None else robot
+    if robot.name != name:
+        raise ValueError(f"robot must be {name!r}, with which learned was learned, got {robot.name!r}")
+    gait = _command_gait(learned, robot) if is_steered(learned) else _speed_gait(learned, robot)
     defaults = {
-        "robot": ROBOTS[robot],
+        "robot": robot,
         "balance": Balance(**task.get("balance", {})),
         "com": task.get("com", "one_step"),
     }
@@ -147,24 +155,24 @@ def command_range(learned: Learned) -> tuple[Float[np.ndarray, "3"], Float[np.nd
     return -highest, highest
 
 
-def _command_gait(learned: Learned) -> Callable[[Array], Gait]:
+def _command_gait(learned: Learned, robot: Robot) -> Callable[[Array], Gait]:
     low, high = command_range(learned)
 
     def gait(command: Float[Array, "3"]) -> Gait:
         ends = (jnp.asarray(end, command.dtype) for end in (low, high))
         context = command_context(learned, limited_command(command, *ends))
-        return steered_gait(learned.thetas(context[None])[0])
+        return steered_gait(learned.thetas(context[None])[0], robot=robot)
 
     return gait
 
 
-def _speed_gait(learned: Learned) -> Callable[[Array], Gait]:
+def _speed_gait(learned: Learned, robot: Robot) -> Callable[[Array], Gait]:
     low, high = learned.contexts.low[0], learned.contexts.high[0]
 
     def gait(command: Float[Array, "3"]) -> Gait:
         speed = jnp.clip(jnp.abs(command[0]), low, high)
         context = command_context(learned, speed)
-        params = params_from_theta(learned.thetas(context[None])[0])
+        params = params_from_theta(learned.thetas(context[None])[0], robot=robot)
         ahead = params.step_length * jnp.clip(command[0] / speed, -1.0, 1.0)
         return Gait(params, jnp.stack([ahead, *(params.step_duration * command[1:])]))
 

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from creps_jax import checks
+from creps_jax.robots.robot import NAO, Robot
 from creps_jax.typing import Array, Float, Scalar
 
 __all__ = [
@@ -21,8 +22,12 @@ __all__ = [
     "STEERED_PARAM_NAMES",
     "STEERED_PARAM_UNITS",
     "WalkParams",
+    "humanoid_bounds",
     "params_from_theta",
+    "scaled_bounds",
 ]
+
+Bounds = tuple[tuple[float, ...], tuple[float, ...]]
 
 GRAVITY = 9.81
 """Acceleration of gravity, m/s^2."""
@@ -96,12 +101,13 @@ NAO_STEERED_BOUNDS = (
 )
 """Bounds of a NAO's steered walk: `NAO_BOUNDS`, with steps backward, sideways and turning."""
 
-# What the engine accepts, whatever theta says. Within it every plan is finite.
+# What the engine accepts of a NAO, whatever theta says. Within it every plan is finite.
 SAFE_LOW = (0.0, 0.10, 0.0, 0.08, -30.0, -1.0, -1.0, -0.2, 0.0, 0.0)
 SAFE_HIGH = (1.0, 0.22, 0.15, 4.0, 30.0, 2.0, 2.0, 0.2, 4.0, 10.0)
 # Amplitude at which the spring's acceleration would reach that of gravity is A = g T^2 / (4 pi^2): there
 # the ZMP equation is singular. Share of it that is allowed.
 MAX_AMPLITUDE_SHARE = 0.6
+# And in any case, for a NAO, m.
 MAX_AMPLITUDE = 0.05
 # Share of a step that double support may fill; the swing foot needs the rest.
 MAX_DOUBLE_SUPPORT_SHARE = 0.6
@@ -137,8 +143,33 @@ class WalkParams(NamedTuple):
     step_growth: Scalar
 
 
+def scaled_bounds(robot: Robot, bounds: Bounds = NAO_BOUNDS) -> Bounds:
+    """Return bounds of the ten parameters of a NAO, scaled to another robot.
+
+    Lengths scale with the leg, times with the root of its length: the walk has the same Froude number.
+
+    Args:
+        robot: The robot.
+        bounds: Lower and upper bounds for the simulated NAO.
+    """
+    return tuple(  # type: ignore[return-value]
+        tuple(value * factor for value, factor in zip(bound, scales(robot), strict=True)) for bound in bounds
+    )
+
+
+def humanoid_bounds(robot: Robot) -> Bounds:
+    """Return the bounds in which a humanoid learns to walk: those of the NAO, scaled."""
+    return scaled_bounds(robot)
+
+
+def scales(robot: Robot) -> tuple[float, ...]:
+    """Return the factor from each of the ten parameters of the simulated NAO to that of a robot."""
+    factors = {"m": robot.size, "s": math.sqrt(robot.size), "m/s": math.sqrt(robot.size)}
+    return tuple(factors.get(unit, 1.0) for unit in PARAM_UNITS)
+
+
 @checks.arguments
-def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
+def params_from_theta(theta: Float[Array, "10"], *, robot: Robot = NAO) -> WalkParams:
     """Turn a parameter vector in the paper's order and units into settings that the engine can plan with.
 
     Any finite theta is accepted: each entry is limited to what gives a finite plan. The amplitude is
@@ -147,6 +178,7 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
 
     Args:
         theta: Parameters in the order of `PARAM_NAMES` and the units of `PARAM_UNITS` (the lean in degrees).
+        robot: Who walks; the limits scale with its leg.
 
     Returns:
         The settings, in SI units.
@@ -154,10 +186,12 @@ def params_from_theta(theta: Float[Array, "10"]) -> WalkParams:
     Raises:
         ValueError: If theta has not one entry for each parameter.
     """
-    safe = jnp.clip(theta, jnp.asarray(SAFE_LOW, theta.dtype), jnp.asarray(SAFE_HIGH, theta.dtype))
+    low, high = (jnp.asarray(bound, theta.dtype) for bound in scaled_bounds(robot, (SAFE_LOW, SAFE_HIGH)))
+    safe = jnp.clip(theta, low, high)
     params = WalkParams(*safe)
     duration = params.step_duration
-    highest = jnp.minimum(MAX_AMPLITUDE_SHARE * GRAVITY * duration**2 / (4.0 * math.pi**2), MAX_AMPLITUDE)
+    singular = GRAVITY * duration**2 / (4.0 * math.pi**2)
+    highest = jnp.minimum(MAX_AMPLITUDE_SHARE * singular, robot.size * MAX_AMPLITUDE)
     return params._replace(
         amplitude=jnp.minimum(params.amplitude, highest),
         lean=params.lean * (math.pi / 180.0),

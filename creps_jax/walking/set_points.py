@@ -11,8 +11,8 @@ __all__ = ["next_set_point"]
 
 @checks.arguments
 def next_set_point(
-    set_point: Float[Array, "22"], target: Float[Array, "22"], period: float, *, robot: Robot = NAO
-) -> Float[Array, "22"]:
+    set_point: Float[Array, " nu"], target: Float[Array, " nu"], period: float, *, robot: Robot = NAO
+) -> Float[Array, " nu"]:
     """Move a set-point towards its target, no faster than the joints can turn.
 
     Args:

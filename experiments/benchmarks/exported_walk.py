@@ -23,7 +23,7 @@ import tyro
 from creps_jax.errors import UserError
 from creps_jax.policies.learned import Learned
 from creps_jax.robots.robot import Robot
-from creps_jax.simulation.models import load_nao
+from creps_jax.simulation.models import load_model
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tools import tables
 from creps_jax.tools.command_line import answer
@@ -98,9 +98,9 @@ class Simulation:
     """A robot in plain MuJoCo, with the servos of its model."""
 
     def __init__(self, robot: Robot, set_point: np.ndarray):
-        self._model = load_nao(robot)
+        self._model = load_model(robot)
         self._data = mujoco.MjData(self._model)
-        self._data.qpos[2] = robot.geometry.torso_height
+        self._data.qpos[2] = robot.torso_height
         self._data.qpos[7:] = set_point
         mujoco.mj_forward(self._model, self._data)
         # Down until the lowest point of the feet is on the floor.

@@ -16,8 +16,9 @@ from creps_jax.search.creps import Creps, CrepsState, creps
 from creps_jax.search.fit import fit_within
 from creps_jax.tasks import Task, average_repeats, penalised, sigmoid_constrained
 from creps_jax.tasks.closed_loop import WalkNoise
-from creps_jax.tasks.walking import nao_walk
+from creps_jax.tasks.walking import WalkReward, nao_walk
 from creps_jax.tools.play import START_UP, load_walking_policy
+from creps_jax.tools.robots import is_spec, robot_id
 from creps_jax.training import evaluate
 from creps_jax.walking.params import PARAM_NAMES, PARAM_UNITS
 from experiments.learning import Log, Plan, Session, learn, trial_keys
@@ -42,7 +43,12 @@ def learn_to_walk(
     settings: Settings, key: jax.Array, *, session: Session, name: str, start: LinearGaussian | None = None
 ) -> tuple[CrepsState, Log]:
     """Learn in all trials, by default from `first_policy`; see `learn` for the log."""
-    task = make_task(settings, noise=settings.learning_noise, duration=settings.learning_duration)
+    task = make_task(
+        settings,
+        noise=settings.learning_noise,
+        duration=settings.learning_duration,
+        reward=WalkReward(upright=settings.upright),
+    )
     return learn(
         trial_keys(key, settings.trials),
         average_repeats(task, settings.repeats),
@@ -76,13 +82,20 @@ def walk_at_all_speeds(
     )
 
 
-def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None = None) -> Task:
+def make_task(
+    settings: Settings,
+    *,
+    noise: float = 1.0,
+    duration: float | None = None,
+    reward: WalkReward = WalkReward(),
+) -> Task:
     """Make the walking task, with parameters limited to their bounds.
 
     Args:
         settings: settings of the experiment.
         noise: factor of the usual noise.
         duration: length of an episode, s; by default the length of the evaluation.
+        reward: weights of the reward; by default the paper's.
     """
     low, high, margin = map(np.array, (*settings.context_range(), settings.margins()))
     task = nao_walk(
@@ -91,11 +104,13 @@ def make_task(settings: Settings, *, noise: float = 1.0, duration: float | None 
         sample_context=SAMPLERS[settings.sampler](low - margin, high + margin),
         duration=settings.duration if duration is None else duration,
         start_up=START_UP,
+        reward=reward,
         noise=WalkNoise().times(noise),
         balance=settings.balance(),
         physics=PHYSICS[settings.physics],
         conditions=settings.conditions(),
         robot=settings.ranges().robot,
+        com=settings.com_method(),
     )
     if settings.constraint == PENALTY:
         return penalised(task, *settings.box(), PENALTY_SIZE)
@@ -162,6 +177,14 @@ def as_learned(settings: Settings, policy: LinearGaussian) -> Learned:
     """Return a policy with its features, spaces and task: all that is needed to use it."""
     conditions = settings.conditions()
     low, high = settings.context_range()
+    task = {
+        "name": "walk",
+        "balance": settings.balance()._asdict(),
+        "robot": settings.ranges().robot.name,
+        "com": settings.com_method(),
+    }
+    if is_spec(settings.robot):
+        task["spec"] = robot_id(settings.robot)
     return Learned(
         policy,
         settings.features.make(low, high),
@@ -172,5 +195,5 @@ def as_learned(settings: Settings, policy: LinearGaussian) -> Learned:
             ("m/s", *(condition.unit for condition in conditions)),
         ),
         parameter_space(settings),
-        {"name": "walk", "balance": settings.balance()._asdict(), "robot": settings.robot},
+        task,
     )

@@ -16,7 +16,8 @@ from creps_jax.policies.feature_settings import Features
 from creps_jax.simulation import c, mjx
 from creps_jax.simulation.state import ControlStep
 from creps_jax.tasks.conditions import Condition
-from creps_jax.tools.robots import ROBOTS, Bounds, RobotRanges, find_robot
+from creps_jax.tools.robots import ROBOTS, Bounds, RobotRanges, find_robot, robot_id
+from creps_jax.walking.controller import COM_METHODS
 from creps_jax.walking.params import AUTHOR_BOUNDS, PAPER_BOUNDS
 from creps_jax.walking.posture import Balance
 
@@ -51,7 +52,7 @@ class Settings:
     and RBF width of the scripts that the paper's author published; DEVIATIONS.md lists the differences.
 
     Attributes:
-        robot: robot that walks: nao or nao_h25.
+        robot: robot that walks: nao, nao_h25, or the .toml file that describes a humanoid.
         iterations: iterations of learning.
         trials: trials, all learned at once.
         samples: new samples of each trial in an iteration.
@@ -66,6 +67,8 @@ class Settings:
             paper's update, which has no such test.
         features: kind, number and width of the policy's features.
         bounds: bounds of the parameters: nao, nao_h25, author or paper; None is the bounds of the robot.
+        com: how the CoM is planned, one_step as in the paper, or continuous; None is one_step for a NAO, and
+            continuous for other robots, whose narrow feet do not carry the first step.
         constraint: limit on the parameters at their bounds: sigmoid or penalty. A penalty is subtracted from
             the reward outside of the bounds.
         start_mean: mean of the first policy before squashing; 0 is the middle of the bounds.
@@ -80,6 +83,9 @@ class Settings:
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
         placement_gain: shift of the landing foot towards the side of the tilt, see `Balance`; 0 is the
             paper's engine.
+        filter_time: time constant of the filter for the measured tilt, s, see `Balance`; 0 is no filter.
+        upright: share of the cost of a fall that is given back in learning in proportion to the time before
+            the fall; 0 is the paper's reward.
         sampler: distribution of the contexts in learning: gaussian or uniform.
         margin: distance beyond both ends of the range in which contexts are also drawn in learning, m/s;
             without samples on both sides the ends are learned less well than the middle.
@@ -103,6 +109,7 @@ class Settings:
     significance: float | None = None
     features: Features = Features("rbf", 5)
     bounds: str | None = None
+    com: str | None = None
     constraint: str = SIGMOID
     start_mean: float = 0.0
     start_std: float = 1.0
@@ -113,6 +120,8 @@ class Settings:
     learning_duration: float = 8.0
     heading_gain: float = 0.0
     placement_gain: float = 0.0
+    filter_time: float = 0.0
+    upright: float = 0.0
     sampler: str = "gaussian"
     margin: float = 0.0
     learning_noise: float = 1.0
@@ -127,6 +136,8 @@ class Settings:
         choices = {"constraint": RUN_CONSTRAINTS, "sampler": SAMPLERS, "physics": PHYSICS}
         if self.bounds is not None:
             choices["bounds"] = BOUNDS
+        if self.com is not None:
+            choices["com"] = dict.fromkeys(COM_METHODS)
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise UserError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
@@ -134,8 +145,11 @@ class Settings:
     def resolved(self) -> "Settings":
         """Return the settings with a value in place of each None and "auto" that stands for one."""
         ranges = self.ranges()
-        own = {"low": ranges.low, "high": ranges.high, "bounds": self.robot}
+        own = {"low": ranges.low, "high": ranges.high, "com": self.com_method()}
+        if self.robot in BOUNDS:
+            own["bounds"] = self.robot
         chosen: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name) is None}
+        chosen["robot"] = robot_id(self.robot)
         if self.physics == "auto":
             chosen["physics"] = _fastest_name()
         return dataclasses.replace(self, **chosen)
@@ -146,7 +160,11 @@ class Settings:
 
     def box(self) -> Bounds:
         """Return the bounds of the parameters."""
-        return BOUNDS[self.robot if self.bounds is None else self.bounds]
+        return self.ranges().bounds if self.bounds is None else BOUNDS[self.bounds]
+
+    def com_method(self) -> str:
+        """Return how the CoM is planned."""
+        return self.com or ("one_step" if self.robot in ROBOTS else "continuous")
 
     def speeds(self, num: int = NUM_SPEEDS) -> np.ndarray:
         """Return `num` equally spaced speeds, m/s; by default, with the paper's robot, its 11 speeds."""
@@ -155,7 +173,7 @@ class Settings:
 
     def balance(self) -> Balance:
         """Return the gains of the response to the measured orientation."""
-        return Balance(self.heading_gain, self.placement_gain)
+        return Balance(self.heading_gain, self.placement_gain, self.filter_time)
 
     def conditions(self) -> tuple[Condition, ...]:
         """Return the context variables after the speed."""

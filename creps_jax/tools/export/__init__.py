@@ -33,7 +33,8 @@ def export(
     Args:
         to: the file; its ending decides on the format. An existing file is overwritten.
         policy: policy file; None is the latest learned walking policy of the robot, or else the shipped one.
-        robot: name of the robot; None is the robot of the file, or without a file the NAO.
+        robot: name of the robot, or the file that describes it; None is the robot of the policy, or without a
+            policy the NAO.
         speed: speed of the walk, m/s; required for a walk, and only for a walk.
         duration: length of the walk, s; only for a walk, 8 by default.
         period: time between two set-points, s; only for a walk, 0.02 by default.
@@ -52,9 +53,10 @@ def export(
     if ending in _WHOLE_WALK:
         import_mjx_quietly()
         from creps_jax.tools.export import walk_c
-        from creps_jax.tools.play import load_walking_policy
+        from creps_jax.tools.play import load_walking_policy, robot_of
 
-        walk_c.save(to, load_walking_policy(path, robot, can_steer=True), period=period)
+        learned = load_walking_policy(path, robot, can_steer=True)
+        walk_c.save(to, learned, robot=robot_of(learned, robot), period=period)
     elif speed is not None:
         import_mjx_quietly()
         from creps_jax.tools.export import trajectory

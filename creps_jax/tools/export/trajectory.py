@@ -10,7 +10,6 @@ from jax import lax
 
 from creps_jax.errors import UserError
 from creps_jax.files import save_arrays, save_text
-from creps_jax.robots.nao_geometry import JOINT_NAMES
 from creps_jax.simulation import c
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD, WalkNoise, is_robot_fallen, make_setup, stand
 from creps_jax.tools import tables
@@ -30,7 +29,7 @@ class Trajectory(NamedTuple):
     Attributes:
         speed: asked speed, m/s.
         time: (n,) time, s.
-        set_point: (n, 22) angles in the order of `nao_geometry.JOINT_NAMES`, with its signs and zeros, rad.
+        set_point: (n, nu) angles in the order of `robot.joint_names`, with its signs and zeros, rad.
         walker: the walker that planned it.
     """
 
@@ -68,11 +67,12 @@ def plan(
     asked = (speed, 0.0, 0.0) if is_steered(policy) else (speed,)
     conditions = command_context(policy, jnp.zeros(len(asked))).tolist()[len(asked) :]
     context = policy.contexts.checked((*asked, *conditions))
+    settings = {"robot": robot_of(policy, robot), "period": period}
     if is_steered(policy):
-        command, walker = asked, learned_walker(policy, period=period)
+        command, walker = asked, learned_walker(policy, **settings)
     else:
-        command = AHEAD
-        walker = straight_walker(jnp.asarray(policy.theta(context)), robot=robot_of(policy), period=period)
+        command, com = AHEAD, policy.task.get("com", "one_step")
+        walker = straight_walker(jnp.asarray(policy.theta(context)), com=com, **settings)
     commands = jnp.tile(jnp.asarray(command, jnp.float32), (round(duration / period), 1))
     walk = jax.jit(lambda commands: open_loop_walk(walker, commands).set_point)
     set_point = np.asarray(walk(commands))
@@ -123,4 +123,4 @@ def save_csv(path: Path, trajectory: Trajectory) -> None:
 def save_npz(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory as .npz: speed (m/s), time (s), set_point (rad), joint_names of the simulation."""
     arrays = {name: values for name, values in trajectory._asdict().items() if name != "walker"}
-    save_arrays(path, {**arrays, "joint_names": np.array(JOINT_NAMES)})
+    save_arrays(path, {**arrays, "joint_names": np.array(trajectory.walker.robot.joint_names)})

@@ -1,0 +1,501 @@
+"""Make a walking humanoid of an MJCF file and a short description; the rest is derived from the model."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from creps_jax import checks
+from creps_jax.robots import mjcf_model
+from creps_jax.robots.humanoid import Humanoid, LegChain
+from creps_jax.robots.mjcf_model import Servo, named
+from creps_jax.robots.robot import NAO_LEG_LENGTH
+from creps_jax.robots.screw_kinematics import chain_fk, chain_ik
+from creps_jax.typing import Float
+
+__all__ = ["humanoid_from_mjcf"]
+
+GRAVITY = 9.81
+# Gains of the servos: stiffness relative to weight times leg, and the damping time for a NAO's leg, s.
+# At a quarter of this stiffness robots of 20 to 33 kg fall in all gaits.
+_STIFFNESS, _DAMPING_TIME = 10.0, 0.01
+# Largest speed of a joint if it is not given, rad/s.
+_MAX_SPEED = 8.0
+# Speeds of the simulated NAO, m/s; those of another robot have the same Froude number if they are not given.
+_NAO_SPEEDS = (0.1, 0.5)
+# An axis is along y if its y component is larger than this.
+_ALONG = 0.8
+# Bend of the knee, of the first guess and the least, rad; height of the hip, as a share of the leg's length.
+_FIRST_BEND, _LEAST_BEND, _STANDING_HEIGHT = 0.6, 0.03, 0.88
+# Height within which the points of a sole lie, m, and share of the foot's length that they span.
+_SOLE_FLATNESS, _SOLE_SHARE = 0.006, 0.5
+_MIRROR_TOLERANCE = 0.02
+_KINEMATICS_TOLERANCE = 1e-4
+# Weight, in the inverse kinematics, of the rotation that a leg of five joints cannot make.
+_MISSING_WEIGHT = 0.03
+
+
+class _Leg(NamedTuple):
+    """A leg as it is in the model: names of joints, foot body and geoms of the sole, and the joints' ids."""
+
+    joints: tuple[str, ...]
+    foot: str
+    geoms: tuple[str, ...]
+    ids: tuple[int, ...]
+
+
+def humanoid_from_mjcf(
+    path: Path | str,
+    *,
+    left_leg: Sequence[str],
+    right_leg: Sequence[str],
+    feet: Sequence[str],
+    name: str | None = None,
+    crouch: Sequence[float] | None = None,
+    held: Mapping[str, float] | None = None,
+    arm_swing: Mapping[str, float] | None = None,
+    kp: float | None = None,
+    kv: float | None = None,
+    max_speed: float | Mapping[str, float] | None = None,
+    max_torque: float | None = None,
+    speeds: Sequence[float] | None = None,
+) -> Humanoid:
+    """Read a humanoid from its MuJoCo model, so that it can walk.
+
+    The trunk is the body with the free joint; it must face along x. From the model come the joint axes, the
+    soles, the lengths, the centre of mass, and the limits of joints and motors. Each joint gets a position
+    servo. Meshes take no part in contacts; the feet need a box, sphere, capsule, cylinder or ellipsoid.
+
+    Args:
+        path: The MJCF file.
+        left_leg: Names of the joints of the left leg, from the hip to the ankle; five or six.
+        right_leg: Those of the right leg, which must mirror the left one.
+        feet: Names of the left and the right foot body.
+        name: Name of the robot; by default that of the file.
+        crouch: Angles of the left leg with bent knees, rad; by default knees bent forwards.
+        held: Angles at which other joints are held, by name, rad; zero by default.
+        arm_swing: Change of a joint's angle for each metre that the left foot is ahead of the right one, by
+            name, rad/m; none by default.
+        kp: Stiffness of the servos, N m/rad; by default ten times weight times leg.
+        kv: Damping of the servos, N m s/rad; by default from `kp` and the length of the leg.
+        max_speed: Largest speed of all joints, or of each by name, rad/s; 8 by default.
+        max_torque: Torque of the motors for which the model states no limit, N m.
+        speeds: Lowest and highest speed at which it is to walk, m/s; by default those of a NAO, scaled.
+
+    Raises:
+        ValueError: If the file cannot be read, a name is not in the model, the joints of a leg are not in the
+            order of the model, the legs do not mirror each other, the knee bends backwards, a foot has no
+            geom or only meshes, the soles are not level with all leg angles zero, or a joint has no actuator
+            or no torque limit.
+    """
+    path = Path(path)
+    source = {key: value for key, value in locals().items() if value is not None and key != "path"}
+    spec = mjcf_model.read_spec(path)
+    model = mjcf_model.compiled(spec, path)
+    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+        raise ValueError(
+            f"the first joint of the model {path} must be the free joint of the trunk, got another"
+        )
+    servos = mjcf_model.read_servos_of(model, max_torque)
+    left, right = (
+        _read_leg(model, spec, side, joints, foot)
+        for side, joints, foot in zip(
+            ("left", "right"), (left_leg, right_leg), _pair("feet", feet), strict=True
+        )
+    )
+    names = tuple(servos)
+    held = _by_joint("held", held, names)
+    data = _posed(model, held)
+    chains = [_chain(model, data, leg, servos) for leg in (left, right)]
+    _check_mirrored(chains, (left, right))
+    chains = [_with_knee_ahead(chain, leg) for chain, leg in zip(chains, (left, right), strict=True)]
+    posture = _posture(chains, (left, right), names, held, crouch)
+    _check_kinematics(model, chains, (left, right), held)
+    return _assembled(
+        spec, model, path, source, chains, (left, right), servos, posture, data,
+        name=name or path.stem,
+        arm_swing=_by_joint("arm_swing", arm_swing, names),
+        gains=(kp, kv),
+        max_speed=max_speed,
+        speeds=speeds,
+    )  # fmt: skip
+
+
+def _read_leg(
+    model: mujoco.MjModel, spec: mujoco.MjSpec, side: str, joints: Sequence[str], foot: str
+) -> _Leg:
+    """Check the names of a leg and their order in the tree of bodies."""
+    known = [model.joint(i).name for i in range(1, model.njnt)]
+    if isinstance(joints, str) or len(joints) not in (5, 6):
+        raise ValueError(f"{side}_leg must name five or six joints from hip to ankle, got {joints!r}")
+    ids = tuple(model.joint(named("joint", joint, known)).id for joint in joints)
+    named("body", foot, [model.body(i).name for i in range(1, model.nbody)])
+    bodies = [int(model.jnt_bodyid[i]) for i in ids] + [model.body(foot).id]
+    for (first, upper), (second, lower) in zip(
+        zip(joints, bodies, strict=False), zip((*joints[1:], foot), bodies[1:], strict=True), strict=True
+    ):
+        if not _is_below(model, lower, upper):
+            raise ValueError(
+                f"{side}_leg must list the joints from hip to ankle, as they follow each other in the model: "
+                f"{second!r} must come below {first!r}, got the order {', '.join(joints)}, foot {foot}"
+            )
+    skipped = [
+        model.joint(j).name
+        for body in _path(model, bodies[-1], bodies[0])
+        for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
+        if j not in ids
+    ]
+    if skipped:
+        raise ValueError(
+            f"{side}_leg must list all joints from hip to foot, got none of {', '.join(skipped)}, which "
+            f"the model has between {joints[0]} and {foot}"
+        )
+    return _Leg(tuple(joints), foot, _sole_geoms(model, spec, side, foot), ids)
+
+
+def _sole_geoms(model: mujoco.MjModel, spec: mujoco.MjSpec, side: str, foot: str) -> tuple[str, ...]:
+    """Return the names of the solid geoms of a foot."""
+    bodies = [spec.body(model.body(i).name) for i in _subtree(model, model.body(foot).id)]
+    geoms = [geom for body in bodies for geom in body.geoms]
+    paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
+    solid = [g for g in geoms if g.contype != 0 or g.conaffinity != 0 or g.name in paired]
+    simple = [geom for geom in solid if geom.type != mujoco.mjtGeom.mjGEOM_MESH]
+    if not simple:
+        found = "only meshes" if any(g.type == mujoco.mjtGeom.mjGEOM_MESH for g in solid or geoms) else "none"
+        raise ValueError(
+            f"the {side} foot {foot!r} must have a geom that touches the floor, a box, sphere, capsule, "
+            f"cylinder or ellipsoid, got {found}: add one to the body in the model"
+        )
+    return tuple(geom.name for geom in simple)
+
+
+def _posed(model: mujoco.MjModel, held: Mapping[str, float], angles: Mapping[str, float] | None = None):
+    """Return the kinematics of the robot with its trunk at the origin and unturned."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = 0.0
+    data.qpos[3] = 1.0
+    for joint, angle in (dict(held) | dict(angles or {})).items():
+        data.qpos[model.joint(joint).qposadr[0]] = angle
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    return data
+
+
+def _chain(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg, servos: Mapping[str, Servo]) -> LegChain:
+    """Read the axes of a leg, its sole and the limits of its joints, with all its angles zero."""
+    ids = list(leg.ids)
+    axes, points = data.xaxis[ids].copy(), data.xanchor[ids].copy()
+    pitch = _pitch_joints(axes, leg)
+    low, _ = _sole_box(model, data, leg)
+    sole = np.eye(4)
+    sole[:3, 3] = points[pitch[2], 0], points[-1, 1], low[2]
+    weights = np.ones(6)
+    for rotation in range(3):
+        if np.abs(axes[:, rotation]).max() < _ALONG or (rotation == 0 and len(ids) == 5):
+            weights[3 + rotation] = _MISSING_WEIGHT
+    limits = np.array([(servos[name].low, servos[name].high) for name in leg.joints])
+    return LegChain(axes, points, sole, limits[:, 0], limits[:, 1], weights)
+
+
+def _pitch_joints(axes: Float[np.ndarray, "k 3"], leg: _Leg) -> tuple[int, int, int]:
+    """Return which joints of a leg are those of hip pitch, knee and ankle pitch."""
+    pitch = np.flatnonzero(np.abs(axes[:, 1]) > _ALONG)
+    if len(pitch) != 3:
+        names = ", ".join(leg.joints[i] for i in pitch) or "none"
+        raise ValueError(
+            "a leg must have three joints whose axes point along y, those of hip, knee and ankle "
+            f"(the trunk must face along x), got {names} in the leg {', '.join(leg.joints)}"
+        )
+    return tuple(int(i) for i in pitch)  # type: ignore[return-value]
+
+
+def _sole_box(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest corner of a box around the sole, in the frame of the trunk, m.
+
+    Raises:
+        ValueError: If the sole is not level.
+    """
+    points = np.concatenate([_support_points(model, data, name) for name in leg.geoms])
+    touching = points[points[:, 2] < points[:, 2].min() + _SOLE_FLATNESS]
+    spanned, length = np.ptp(touching[:, 0]), np.ptp(points[:, 0])
+    if spanned < _SOLE_SHARE * length:
+        raise ValueError(
+            f"the sole of {leg.foot!r} must be level with all joints of the leg at zero, got lowest points "
+            f"that span {spanned:.3f} of its {length:.3f} m"
+        )
+    return touching.min(axis=0), touching.max(axis=0)
+
+
+def _support_points(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Float[np.ndarray, "n 3"]:
+    """Return points of a geom between which it can touch a floor below, in the frame of the trunk, m."""
+    geom = model.geom(name).id
+    size, position, rotation = model.geom_size[geom], data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
+    kind = model.geom_type[geom]
+    down = np.array([0.0, 0.0, -1.0])
+    signs = np.array([-1.0, 1.0])
+    if kind == mujoco.mjtGeom.mjGEOM_BOX:
+        corners = np.stack(np.meshgrid(signs, signs, signs), -1).reshape(-1, 3)
+        return position + corners * size @ rotation.T
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return (position + size[0] * down)[None]
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return position + signs[:, None] * size[1] * rotation[:, 2] + size[0] * down
+    if kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        around = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+        rim = np.stack([size[0] * np.cos(around), size[0] * np.sin(around)], 1)
+        local = np.concatenate([np.column_stack([rim, np.full(16, sign * size[1])]) for sign in signs])
+        return position + local @ rotation.T
+    # The lowest point of an ellipsoid is where its normal points down.
+    scaled = size * (rotation.T @ down)
+    return (position + rotation @ (size * scaled / np.linalg.norm(scaled)))[None]
+
+
+def _check_mirrored(chains: Sequence[LegChain], legs: Sequence[_Leg]) -> None:
+    """Check that the right leg mirrors the left one, up to the signs of its angles."""
+    left, right = chains
+    if len(legs[0].joints) != len(legs[1].joints):
+        raise ValueError(
+            f"both legs must have equally many joints, got {legs[0].joints} and {legs[1].joints}"
+        )
+    if not left.points[-1, 1] > 0.0 > right.points[-1, 1]:
+        raise ValueError(
+            "left_leg must be on the left side, where y is positive, and right_leg on the right, got "
+            f"ankles at y = {left.points[-1, 1]:.3f} and {right.points[-1, 1]:.3f} m"
+        )
+    mirror = np.array([1.0, -1.0, 1.0])
+    for i, (first, second) in enumerate(zip(legs[0].joints, legs[1].joints, strict=True)):
+        axis = -mirror * left.axes[i]
+        apart = mirror * left.points[i] - right.points[i]
+        # A point may be anywhere on its axis.
+        apart = apart - (apart @ axis) * axis
+        if abs(abs(axis @ right.axes[i]) - 1.0) > 1e-2 or np.linalg.norm(apart) > _MIRROR_TOLERANCE:
+            raise ValueError(
+                f"right_leg must mirror left_leg joint by joint, got {first!r} and {second!r}, whose axes "
+                "do not mirror each other"
+            )
+
+
+def _with_knee_ahead(chain: LegChain, leg: _Leg) -> LegChain:
+    """Limit the knee to angles at which it is bent forwards.
+
+    Raises:
+        ValueError: If it has none.
+    """
+    hip, knee, ankle = _pitch_joints(chain.axes, leg)
+    thigh, shank = (chain.points[b, ::2] - chain.points[a, ::2] for a, b in ((hip, knee), (knee, ankle)))
+    # Rotations about y from the thigh's direction to that of the shank: positive moves the ankle back.
+    bend = np.arctan2(-shank[0], -shank[1]) - np.arctan2(-thigh[0], -thigh[1])
+    sign = np.sign(chain.axes[knee, 1])
+    straight = sign * (_LEAST_BEND - bend)
+    lower, upper = chain.lower.copy(), chain.upper.copy()
+    if sign > 0:
+        lower[knee] = max(lower[knee], straight)
+    else:
+        upper[knee] = min(upper[knee], straight)
+    if upper[knee] - lower[knee] < _FIRST_BEND:
+        raise ValueError(
+            f"the knee {leg.joints[knee]!r} must bend by {_FIRST_BEND} rad or more so that it is ahead of "
+            "hip and ankle, where x is positive: in its range, "
+            f"{chain.lower[knee]:.2f} to {chain.upper[knee]:.2f} rad, it bends backwards"
+        )
+    return chain._replace(lower=lower, upper=upper)
+
+
+def _posture(
+    chains: Sequence[LegChain],
+    legs: Sequence[_Leg],
+    names: Sequence[str],
+    held: Mapping[str, float],
+    crouch: Sequence[float] | None,
+) -> np.ndarray:
+    """Return the angles of standing: soles level and below the hips, knees bent, found from the crouch."""
+    posture = np.array([held.get(name, 0.0) for name in names])
+    for chain, leg in zip(chains, legs, strict=True):
+        hip, knee, ankle = _pitch_joints(chain.axes, leg)
+        guess = np.zeros(len(leg.joints))
+        if crouch is None:
+            for joint, turn in ((hip, -0.5), (knee, 1.0), (ankle, -0.5)):
+                guess[joint] = turn * _FIRST_BEND * np.sign(chain.axes[joint, 1])
+        else:
+            if len(crouch) != len(guess):
+                raise ValueError(
+                    f"crouch must have an angle for each of {', '.join(leg.joints)}, got {crouch}"
+                )
+            # The right leg's angles have the sign of its axes relative to the mirrored ones.
+            mirrored = chains[0].axes * np.array([-1.0, 1.0, -1.0])
+            signs = 1.0 if chain is chains[0] else np.sign(np.sum(mirrored * chain.axes, axis=1))
+            guess = signs * checks.vector("crouch", crouch)
+        angles = _stand_on(chain, leg, guess)
+        for name, angle in zip(leg.joints, angles, strict=True):
+            posture[list(names).index(name)] = angle
+    return posture
+
+
+def _stand_on(chain: LegChain, leg: _Leg, guess: np.ndarray) -> np.ndarray:
+    """Return the angles with which the sole is level, and the ankle below the hip."""
+    hip, _, ankle = _pitch_joints(chain.axes, leg)
+    pose = chain.sole.copy()
+    pose[0, 3] = chain.points[hip, 0]
+    pose[2, 3] += (1.0 - _STANDING_HEIGHT) * _leg_length(chain, leg)
+    pose[2, 3] += chain.points[hip, 2] - chain.points[ankle, 2] - _leg_length(chain, leg)
+    solve = jax.jit(lambda pose, guess: chain_ik(pose, guess, chain, iterations=100))
+    angles = solve(jnp.asarray(pose, jnp.float32), jnp.asarray(guess, jnp.float32))
+    found = np.asarray(chain_fk(angles, chain))
+    apart = np.abs(found - pose)[:3, 3].max()
+    if apart > 0.01:
+        raise ValueError(
+            f"the leg {', '.join(leg.joints)} must reach the floor below its hip with its knee bent, got a "
+            f"sole {apart:.3f} m off: name a crouch, or correct the ranges of the joints"
+        )
+    return np.asarray(angles, float)
+
+
+def _leg_length(chain: LegChain, leg: _Leg) -> float:
+    hip, knee, ankle = _pitch_joints(chain.axes, leg)
+    return float(
+        sum(np.linalg.norm((chain.points[b] - chain.points[a])[::2]) for a, b in ((hip, knee), (knee, ankle)))
+    )
+
+
+def _check_kinematics(
+    model: mujoco.MjModel, chains: Sequence[LegChain], legs: Sequence[_Leg], held: Mapping[str, float]
+) -> None:
+    """Compare our forward kinematics with MuJoCo's at random angles."""
+    rng = np.random.default_rng(0)
+    for chain, leg in zip(chains, legs, strict=True):
+        fk = jax.jit(lambda angles, chain=chain: chain_fk(angles, chain))
+        home = _foot_pose(model, _posed(model, held), leg)
+        T_foot_sole = np.linalg.inv(home) @ chain.sole
+        for _ in range(20):
+            angles = rng.uniform(np.maximum(chain.lower, -1.5), np.minimum(chain.upper, 1.5)).astype(
+                np.float32
+            )
+            theirs = _foot_pose(model, _posed(model, held, dict(zip(leg.joints, angles, strict=True))), leg)
+            error = np.abs(np.asarray(fk(jnp.asarray(angles))) - theirs @ T_foot_sole).max()
+            if not error < _KINEMATICS_TOLERANCE:
+                raise ValueError(
+                    f"the pose of {leg.foot!r} must follow from the joints {', '.join(leg.joints)}, got "
+                    f"{error:.2g} m between our kinematics and MuJoCo's: are joints of the leg coupled?"
+                )
+
+
+def _foot_pose(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg) -> np.ndarray:
+    body = model.body(leg.foot).id
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = data.xmat[body].reshape(3, 3), data.xpos[body]
+    return pose
+
+
+def _assembled(
+    spec: mujoco.MjSpec,
+    model: mujoco.MjModel,
+    path: Path,
+    source: Mapping[str, Any],
+    chains: Sequence[LegChain],
+    legs: Sequence[_Leg],
+    servos: Mapping[str, Servo],
+    posture: np.ndarray,
+    data: mujoco.MjData,
+    *,
+    name: str,
+    arm_swing: Mapping[str, float],
+    gains: tuple[float | None, float | None],
+    max_speed: float | Mapping[str, float] | None,
+    speeds: Sequence[float] | None,
+) -> Humanoid:
+    """Derive lengths, centre of mass and gains, and put the record together."""
+    names = tuple(servos)
+    left, right = chains
+    hip, _, ankle = _pitch_joints(left.axes, legs[0])
+    length = _leg_length(left, legs[0])
+    hip_x, _, hip_z = left.points[hip]
+    ankle_height = left.points[ankle, 2] - left.sole[2, 3]
+    low, high = _sole_box(model, data, legs[0])
+    standing = _posed(model, dict(zip(names, posture, strict=True)))
+    com = standing.subtree_com[1]
+    kp, kv = gains
+    mass = float(model.body_subtreemass[1])
+    kp = _STIFFNESS * mass * GRAVITY * length if kp is None else checks.number("kp", kp, above=0.0)
+    kv = (
+        kp * _DAMPING_TIME * np.sqrt(length / NAO_LEG_LENGTH)
+        if kv is None
+        else checks.number("kv", kv, least=0.0)
+    )
+    servo_gains = {joint: (float(kp), float(kv)) for joint in names}
+    if isinstance(max_speed, Mapping):
+        fastest = _by_joint("max_speed", max_speed, names)
+        max_speeds = tuple(fastest.get(joint, _MAX_SPEED) for joint in names)
+    else:
+        fastest = _MAX_SPEED if max_speed is None else checks.number("max_speed", max_speed, above=0.0)
+        max_speeds = (float(fastest),) * len(names)
+    lower, upper = (np.array([getattr(servos[joint], end) for joint in names]) for end in ("low", "high"))
+    for chain, leg in zip(chains, legs, strict=True):
+        where = [names.index(joint) for joint in leg.joints]
+        lower[where], upper[where] = chain.lower, chain.upper
+    root = np.sqrt(length / NAO_LEG_LENGTH)
+    return Humanoid(
+        name=name,
+        joint_names=names,
+        joint_lower=tuple(lower.tolist()),
+        joint_upper=tuple(upper.tolist()),
+        max_joint_speed=max_speeds,
+        max_joint_torque=tuple(servo.torque for servo in servos.values()),
+        left_leg=tuple(names.index(joint) for joint in legs[0].joints),
+        right_leg=tuple(names.index(joint) for joint in legs[1].joints),
+        posture=tuple(posture.tolist()),
+        arm_swing=tuple(arm_swing.get(joint, 0.0) for joint in names),
+        hip_centre=(float(hip_x), float(hip_z)),
+        leg_length=length,
+        foot_spacing=float(left.sole[1, 3] - right.sole[1, 3]),
+        ankle_height=float(ankle_height),
+        torso_height=float(length + ankle_height - hip_z),
+        com_above_hip=float(com[2] - hip_z),
+        com_ahead_of_hip=float(com[0] - hip_x),
+        zmp_ahead_of_ankle=float(0.5 * (low[0] + high[0]) - left.sole[0, 3]),
+        own_names=names,
+        own_signs=(1.0,) * len(names),
+        left=left,
+        right=right,
+        model=mjcf_model.walking_model(spec, {leg.foot: leg.geoms for leg in legs}, servos, servo_gains),
+        film_model=mjcf_model.film_model(spec, servos, servo_gains),
+        speeds=_pair("speeds", [root * v for v in _NAO_SPEEDS] if speeds is None else speeds),
+        source=dict(source),
+    )
+
+
+def _by_joint(argument: str, values: Mapping[str, float] | None, names: Sequence[str]) -> dict[str, float]:
+    """Return numbers by joint after checking the names."""
+    return {
+        named("joint", joint, names): float(checks.number(f"{argument} of {joint}", value))
+        for joint, value in (values or {}).items()
+    }
+
+
+def _pair(argument: str, values: Sequence[Any]) -> tuple[Any, Any]:
+    if isinstance(values, str) or len(values) != 2:
+        raise ValueError(f"{argument} must be two values, got {values!r}")
+    first, second = values
+    return first, second
+
+
+def _is_below(model: mujoco.MjModel, lower: int, upper: int) -> bool:
+    """Return whether a body is another one or hangs on it."""
+    while lower not in (0, upper):
+        lower = int(model.body_parentid[lower])
+    return lower == upper
+
+
+def _path(model: mujoco.MjModel, lower: int, upper: int) -> list[int]:
+    """Return the bodies from one up to another one above it."""
+    bodies = [lower]
+    while bodies[-1] != upper:
+        bodies.append(int(model.body_parentid[bodies[-1]]))
+    return bodies
+
+
+def _subtree(model: mujoco.MjModel, top: int) -> list[int]:
+    return [body for body in range(1, model.nbody) if _is_below(model, body, top)]

@@ -1,0 +1,293 @@
+"""Prepare the MuJoCo model of a humanoid for walking: a floor, a position servo a joint, simple feet."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from creps_jax import checks
+from creps_jax.errors import suggest
+
+__all__ = ["Servo", "compiled", "film_model", "read_spec", "walking_model"]
+
+TIMESTEP = 0.004
+_ITERATIONS, _LINE_ITERATIONS = 10, 10
+# Contact bits: the floor touches every solid, and the feet also touch each other.
+_FLOOR, _SOLID, _FOOT = 1, 2, 4
+_MESH, _PLANE, _HINGE = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtJoint.mjJNT_HINGE
+
+
+class Servo:
+    """What a joint's motor can do, read from the model: torque, N m, and the range of angles, rad."""
+
+    def __init__(self, torque: float, low: float, high: float) -> None:
+        self.torque, self.low, self.high = torque, low, high
+
+
+def read_spec(path: Path) -> mujoco.MjSpec:
+    """Read an MJCF file, and name the geoms that have no name.
+
+    Raises:
+        ValueError: If it cannot be read.
+    """
+    if not path.is_file():
+        raise ValueError(f"the model must be an MJCF file, got {path}, which does not exist")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ValueError(
+            f"the model {path} must be an MJCF file that MuJoCo can read: {_first_line(error)}"
+        ) from error
+    for index, geom in enumerate(spec.geoms):
+        geom.name = geom.name or f"creps_jax_geom_{index}"
+    return spec
+
+
+def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
+    """Compile a model without the meshes, whose files may be missing.
+
+    Masses that the full model computes from meshes are kept if their files are there.
+
+    Raises:
+        ValueError: If MuJoCo cannot compile it.
+    """
+    spec = spec.copy()
+    _keep_masses(spec)
+    _delete_meshes(spec)
+    _delete(spec, spec.keys, spec.sensors)
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ValueError(f"the model {path} must compile without its meshes: {_first_line(error)}") from error
+
+
+def walking_model(
+    spec: mujoco.MjSpec,
+    feet: Mapping[str, Sequence[str]],
+    servos: Mapping[str, Servo],
+    gains: Mapping[str, tuple[float, float]],
+) -> mujoco.MjModel:
+    """Return the model in which a robot walks.
+
+    It has a level floor instead of its own world, no meshes, a position servo for each joint in the order of
+    `servos`, and contacts of the solids with the floor only. The friction is that of the feet.
+
+    Args:
+        spec: The robot as it was read.
+        feet: Names of the geoms under each foot body.
+        servos: The motor of each joint.
+        gains: Stiffness (N m/rad) and damping (N m s/rad) of the servo of each joint.
+    """
+    spec = spec.copy()
+    _keep_masses(spec)
+    frictions = _pair_frictions(spec)
+    _delete_meshes(spec)
+    _set_up(spec, servos, gains)
+    soles = {name for names in feet.values() for name in names}
+    for geom in spec.geoms:
+        is_solid = geom.contype != 0 or geom.conaffinity != 0
+        geom.contype, geom.conaffinity = (_SOLID if is_solid else 0), 0
+        if geom.name in soles:
+            geom.contype, geom.conaffinity, geom.condim, geom.priority = _SOLID | _FOOT, _FOOT, 3, 1
+            geom.friction = frictions.get(geom.name, geom.friction)
+    _add_floor(spec)
+    spec.compiler.discardvisual = False
+    return spec.compile()
+
+
+def film_model(
+    spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: Mapping[str, tuple[float, float]]
+) -> mujoco.MjModel:
+    """Return the model with which a robot is drawn: with its meshes, if their files are there."""
+    for is_full in (True, False):
+        drawn = spec.copy()
+        if not is_full:
+            _keep_masses(drawn)
+            _delete_meshes(drawn)
+        _set_up(drawn, servos, gains)
+        _add_floor(drawn)
+        try:
+            return drawn.compile()
+        except ValueError:
+            if not is_full:
+                raise
+    raise AssertionError("unreachable")
+
+
+def _set_up(
+    spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: Mapping[str, tuple[float, float]]
+) -> None:
+    """Leave only the robot, give it servos, and set the solver."""
+    for geom in [geom for geom in spec.geoms if geom.parent.name == "world"]:
+        spec.delete(geom)
+    _delete(spec, spec.keys, spec.sensors, spec.pairs, spec.actuators)
+    for joint in spec.joints:
+        if joint.name in servos:
+            joint.actfrclimited = False
+    for name, servo in servos.items():
+        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        stiffness, damping = gains[name]
+        actuator.set_to_position(kp=stiffness, kv=damping)
+        actuator.ctrllimited, actuator.ctrlrange = True, (servo.low, servo.high)
+        actuator.forcelimited, actuator.forcerange = True, (-servo.torque, servo.torque)
+    option = spec.option
+    option.timestep, option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.solver, option.cone = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.iterations, option.ls_iterations = _ITERATIONS, _LINE_ITERATIONS
+    option.gravity, option.wind = (0.0, 0.0, -9.81), (0.0, 0.0, 0.0)
+    # The set-points stay within the limits, and the servos hold the joints near the set-points.
+    option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
+    option.enableflags = 0
+
+
+def _add_floor(spec: mujoco.MjSpec) -> None:
+    """Add a level floor with tiles, and light."""
+    texture = spec.add_texture(
+        name="creps_jax_tiles",
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=(0.40, 0.56, 0.46),
+        rgb2=(0.43, 0.59, 0.49),
+        width=64,
+        height=64,
+    )
+    floor = spec.add_material(name="creps_jax_floor", texrepeat=(1.0, 1.0), texuniform=True)
+    floor.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = texture.name
+    spec.worldbody.add_geom(
+        name="creps_jax_floor",
+        type=_PLANE,
+        size=(0.0, 0.0, 0.05),
+        contype=_FLOOR,
+        conaffinity=_SOLID,
+        # The larger coefficient of two geoms counts: that of the robot.
+        friction=(0.01, 0.005, 0.0001),
+        material=floor.name,
+    )
+    spec.worldbody.add_light(pos=(0.0, 0.0, 3.0), dir=(0.0, 0.3, -1.0), diffuse=(0.5, 0.5, 0.5))
+    if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
+        spec.add_texture(
+            name="creps_jax_sky",
+            type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+            builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+            rgb1=(0.52, 0.68, 0.84),
+            rgb2=(0.93, 0.95, 0.96),
+            width=64,
+            height=384,
+        )
+
+
+def _keep_masses(spec: mujoco.MjSpec) -> None:
+    """Write the masses and inertias that the full model has into its bodies, if it can be compiled."""
+    try:
+        full = spec.copy().compile()
+    except ValueError:
+        return
+    for index, body in enumerate(spec.bodies):
+        if index == 0:
+            continue
+        body.explicitinertial = True
+        body.mass, body.ipos, body.iquat = (
+            full.body_mass[index],
+            full.body_ipos[index],
+            full.body_iquat[index],
+        )
+        body.inertia = full.body_inertia[index]
+        body.fullinertia = np.full(6, np.nan)
+
+
+def _delete_meshes(spec: mujoco.MjSpec) -> None:
+    for geom in [geom for geom in spec.geoms if geom.type == _MESH]:
+        spec.delete(geom)
+    _delete(spec, spec.meshes)
+
+
+def _delete(spec: mujoco.MjSpec, *lists: Sequence[object]) -> None:
+    for elements in lists:
+        for element in list(elements):
+            spec.delete(element)
+
+
+def _pair_frictions(spec: mujoco.MjSpec) -> dict[str, Sequence[float]]:
+    """Return the friction of each geom that touches a geom of the world by an explicit pair."""
+    ground = {geom.name for geom in spec.geoms if geom.parent.name == "world"} | {"floor"}
+    found = {}
+    for pair in spec.pairs:
+        for name, other in ((pair.geomname1, pair.geomname2), (pair.geomname2, pair.geomname1)):
+            if other in ground:
+                found[name] = (pair.friction[0], pair.friction[2], pair.friction[3])
+    return found
+
+
+def named(kind: str, name: str, known: Sequence[str]) -> str:
+    """Return a name of the model after checking that it is there.
+
+    Raises:
+        ValueError: With the nearest name, if it is not.
+    """
+    if name not in known:
+        raise ValueError(f"the model has no {kind} {name!r}{suggest(name, known)}")
+    return name
+
+
+def read_servos_of(model: mujoco.MjModel, max_torque: float | None) -> dict[str, Servo]:
+    """Read the motor of each hinge joint: the smallest torque limit of joint and actuators, and the range.
+
+    Args:
+        model: The compiled robot.
+        max_torque: Torque of the motors whose limit the model does not state, N m.
+
+    Raises:
+        ValueError: If a joint has no actuator, or no torque limit is stated.
+    """
+    servos = {}
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            continue
+        name = model.joint(joint).name
+        if model.jnt_type[joint] != _HINGE:
+            raise ValueError(f"all joints of the robot must be hinges, got {name!r}, which is none")
+        is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        actuators = np.flatnonzero(is_joint & (model.actuator_trnid[:, 0] == joint))
+        if not len(actuators):
+            raise ValueError(f"each joint must have an actuator in the model, got none for {name!r}")
+        torque = _torque_limit(model, joint, actuators)
+        if not np.isfinite(torque):
+            if max_torque is None:
+                raise ValueError(
+                    f"the torque of {name!r} must have a limit: its joint has no actuatorfrcrange, and its "
+                    "actuator no forcerange; name one in the model, or max_torque in the spec"
+                )
+            torque = max_torque
+        servos[name] = Servo(torque, *_range_of(model, joint, actuators))
+    return servos
+
+
+def _torque_limit(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> float:
+    limits = [np.abs(model.jnt_actfrcrange[joint]).min()] if model.jnt_actfrclimited[joint] else []
+    for each in actuators:
+        gear = abs(model.actuator_gear[each, 0])
+        if model.actuator_forcelimited[each]:
+            limits.append(gear * np.abs(model.actuator_forcerange[each]).min())
+        is_motor = model.actuator_biastype[each] == mujoco.mjtBias.mjBIAS_NONE
+        if is_motor and model.actuator_ctrllimited[each]:
+            gain = abs(model.actuator_gainprm[each, 0])
+            limits.append(gear * gain * np.abs(model.actuator_ctrlrange[each]).min())
+    return float(min(limits, default=np.inf))
+
+
+def _range_of(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> tuple[float, float]:
+    """Return the range of a joint, or that of the set-points of its position servo, or a whole turn."""
+    ranges = [model.jnt_range[joint]] if model.jnt_limited[joint] else []
+    for each in actuators:
+        is_servo = model.actuator_biastype[each] == mujoco.mjtBias.mjBIAS_AFFINE
+        is_servo &= model.actuator_biasprm[each, 1] == -model.actuator_gainprm[each, 0] != 0
+        if is_servo and model.actuator_ctrllimited[each]:
+            ranges.append(model.actuator_ctrlrange[each])
+    low = max((float(low) for low, _ in ranges), default=-np.pi)
+    high = min((float(high) for _, high in ranges), default=np.pi)
+    return low, high
+
+
+def _first_line(error: Exception) -> str:
+    return checks.shown(str(error).strip().splitlines()[0])

@@ -1,0 +1,65 @@
+"""Read the description of a robot from a TOML file: the model, and the arguments of `humanoid_from_mjcf`."""
+
+import importlib.util
+import inspect
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from creps_jax.errors import UserError, suggest
+from creps_jax.robots.humanoid import Humanoid
+
+__all__ = ["humanoid_from_toml"]
+
+
+def humanoid_from_toml(path: Path | str) -> Humanoid:
+    """Read a humanoid from a TOML file.
+
+    The key `model` names the MJCF file: a path, relative to the TOML file, or `package:path` for a file of an
+    installed Python package. The other keys are the arguments of `humanoid_from_mjcf`.
+
+    Args:
+        path: The TOML file.
+
+    Raises:
+        UserError: If the file cannot be read, or has a key that is unknown or missing.
+        ValueError: If the robot cannot be made of it, see `humanoid_from_mjcf`.
+    """
+    # MuJoCo is imported only where a robot is read.
+    from creps_jax.robots.mjcf import humanoid_from_mjcf
+
+    path = Path(path)
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UserError(f"the robot must be described by a TOML file, cannot read {path}: {error}") from error
+    parameters = inspect.signature(humanoid_from_mjcf).parameters
+    known = ["model", *(name for name in parameters if name != "path")]
+    for key in values:
+        if key not in known:
+            raise UserError(f"{path} has an unknown key {key!r}{suggest(key, known)}")
+    required = ["model", *(n for n, p in parameters.items() if p.default is p.empty and n != "path")]
+    if missing := [key for key in required if key not in values]:
+        raise UserError(f"{path} must have the keys {', '.join(required)}, got none of {', '.join(missing)}")
+    model = _model_path(path, values.pop("model"))
+    values.setdefault("name", path.stem)
+    try:
+        return humanoid_from_mjcf(model, **values)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{path}: {error}") from error
+
+
+def _model_path(spec: Path, model: Any) -> Path:
+    """Return the path of a model file that is named relative to the description, or within a package."""
+    if not isinstance(model, str):
+        raise UserError(f"model in {spec} must be a path, or package:path, got {model!r}")
+    package, colon, inside = model.partition(":")
+    if not colon:
+        return spec.parent / model
+    found = importlib.util.find_spec(package) if package.isidentifier() else None
+    folders = None if found is None else found.submodule_search_locations
+    if not folders:
+        raise UserError(
+            f"model in {spec} must be in an installed package, got {model!r}: there is no package {package!r}"
+        )
+    return Path(next(iter(folders))) / inside
