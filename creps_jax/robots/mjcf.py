@@ -33,6 +33,8 @@ _ALONG = 0.8
 _FIRST_BEND, _LEAST_BEND, _STANDING_HEIGHT = 0.6, 0.03, 0.88
 # Height within which the points of a sole lie, m, and share of the foot's length that they span.
 _SOLE_FLATNESS, _SOLE_SHARE = 0.006, 0.5
+# Distance between the soles for a leg of the NAO's length, m.
+_SOLE_CLEARANCE = 0.02
 _MIRROR_TOLERANCE = 0.02
 _KINEMATICS_TOLERANCE = 1e-4
 # Weight, in the inverse kinematics, of the rotation that a leg of five joints cannot make.
@@ -62,6 +64,7 @@ def humanoid_from_mjcf(
     kv: float | None = None,
     max_speed: float | Mapping[str, float] | None = None,
     max_torque: float | None = None,
+    foot_spacing: float | None = None,
     speeds: Sequence[float] | None = None,
 ) -> Humanoid:
     """Read a humanoid from its MuJoCo model, so that it can walk.
@@ -84,6 +87,9 @@ def humanoid_from_mjcf(
         kv: Damping of the servos, N m s/rad; by default from `kp` and the length of the leg.
         max_speed: Largest speed of all joints, or of each by name, rad/s; 8 by default.
         max_torque: Torque of the motors for which the model states no limit, N m.
+        foot_spacing: Distance between the ankles when standing and walking, m. By default the soles are
+            close to each other, but not farther apart than the hips: the narrower the stance, the less
+            torque the hips need to carry the robot on one foot.
         speeds: Lowest and highest speed at which it is to walk, m/s; by default those of a NAO, scaled.
 
     Raises:
@@ -121,6 +127,7 @@ def humanoid_from_mjcf(
         arm_swing=_by_joint("arm_swing", arm_swing, names),
         gains=(kp, kv),
         max_speed=max_speed,
+        foot_spacing=foot_spacing,
         speeds=speeds,
     )  # fmt: skip
 
@@ -405,6 +412,7 @@ def _assembled(
     arm_swing: Mapping[str, float],
     gains: tuple[float | None, float | None],
     max_speed: float | Mapping[str, float] | None,
+    foot_spacing: float | None,
     speeds: Sequence[float] | None,
 ) -> Humanoid:
     """Derive lengths, centre of mass and gains, and put the record together."""
@@ -436,6 +444,11 @@ def _assembled(
     for chain, leg in zip(chains, legs, strict=True):
         where = [names.index(joint) for joint in leg.joints]
         lower[where], upper[where] = chain.lower, chain.upper
+    if foot_spacing is None:
+        inner = left.sole[1, 3] - low[1]
+        beside = 2.0 * inner + _SOLE_CLEARANCE * length / NAO_LEG_LENGTH
+        foot_spacing = min(beside, left.sole[1, 3] - right.sole[1, 3])
+    checks.number("foot_spacing", foot_spacing, above=0.0)
     root = np.sqrt(length / NAO_LEG_LENGTH)
     return Humanoid(
         name=name,
@@ -450,7 +463,7 @@ def _assembled(
         arm_swing=tuple(arm_swing.get(joint, 0.0) for joint in names),
         hip_centre=(float(hip_x), float(hip_z)),
         leg_length=length,
-        foot_spacing=float(left.sole[1, 3] - right.sole[1, 3]),
+        foot_spacing=float(foot_spacing),
         ankle_height=float(ankle_height),
         torso_height=float(length + ankle_height - hip_z),
         com_above_hip=float(com[2] - hip_z),
