@@ -447,7 +447,9 @@ def _assembled(
     if foot_spacing is None:
         inner = left.sole[1, 3] - low[1]
         beside = 2.0 * inner + _SOLE_CLEARANCE * length / NAO_LEG_LENGTH
-        foot_spacing = min(beside, left.sole[1, 3] - right.sole[1, 3])
+        below_hips = left.sole[1, 3] - right.sole[1, 3]
+        # A leg of five joints cannot hold its sole level while it leans inward.
+        foot_spacing = min(beside, below_hips) if len(legs[0].joints) == 6 else below_hips
     checks.number("foot_spacing", foot_spacing, above=0.0)
     root = np.sqrt(length / NAO_LEG_LENGTH)
     return Humanoid(

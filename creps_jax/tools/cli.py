@@ -1,4 +1,4 @@
-"""The command line `creps-jax play | drive | export | session`, also `python -m creps_jax.tools`.
+"""The command line `creps-jax play | drive | robot | export | session`, also `python -m creps_jax.tools`.
 
 jax and MuJoCo are imported only when a command needs them: help and mistakes are printed at once.
 """
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import arg, subcommand
+from tyro.conf import Positional, arg, subcommand
 
 from creps_jax.tools.arguments import parse
 from creps_jax.tools.command_line import answer, check_seed, say
@@ -22,6 +22,7 @@ Use a learned policy.
   creps-jax play --speed 0.3        show the parameters and a video of a walk at this speed
   creps-jax play                    show a video of walks at six speeds
   creps-jax drive                   steer a walk with the arrow keys (or --script commands.csv)
+  creps-jax robot k1.toml           check the description of a robot, and try 18 standard gaits
   creps-jax export --to walk.c      write a policy (.onnx, .h), the whole walk (.c) or set-points (.csv, .npz)
   creps-jax session                 learn on a real robot, trial by trial
 
@@ -101,9 +102,23 @@ class Drive:
     seed: int = 0
 
 
+@dataclasses.dataclass(frozen=True)
+class RobotCommand:
+    """Check the description of a robot, and try standard gaits before learning.
+
+    Attributes:
+        robot: The .toml file that describes the robot, or nao or nao_h25.
+        seed: Seed of the noise; 0 by default.
+    """
+
+    robot: Annotated[str, Positional, arg(metavar="ROBOT")]
+    seed: int = 0
+
+
 Command = (
     Annotated[Play, subcommand("play")]
     | Annotated[Drive, subcommand("drive")]
+    | Annotated[RobotCommand, subcommand("robot")]
     | Annotated[Export, subcommand("export")]
     | Annotated[SessionCommand, subcommand("session")]
 )
@@ -117,7 +132,7 @@ def main(arguments: Sequence[str]) -> int:
     return answer(lambda: _run(parse(Command, arguments, prog="creps-jax")))
 
 
-def _run(command: Play | Drive | Export | SessionCommand) -> int:
+def _run(command: Play | Drive | RobotCommand | Export | SessionCommand) -> int:
     return _HANDLERS[type(command)](command)
 
 
@@ -146,6 +161,15 @@ def _drive(command: Drive) -> int:
     return 0
 
 
+def _robot(command: RobotCommand) -> int:
+    check_seed(command.seed)
+    import_mjx_quietly()
+    from creps_jax.tools import robot_check
+
+    robot_check.show(command.robot, seed=command.seed, say=say)
+    return 0
+
+
 def _export(command: Export) -> int:
     from creps_jax.tools.export import export
 
@@ -166,4 +190,10 @@ def _session(command: SessionCommand) -> int:
     return 0
 
 
-_HANDLERS = {Play: _play, Drive: _drive, Export: _export, SessionCommand: _session}
+_HANDLERS = {
+    Play: _play,
+    Drive: _drive,
+    RobotCommand: _robot,
+    Export: _export,
+    SessionCommand: _session,
+}

@@ -47,7 +47,7 @@ def learn_to_walk(
         settings,
         noise=settings.learning_noise,
         duration=settings.learning_duration,
-        reward=WalkReward(upright=settings.upright),
+        reward=WalkReward(upright=settings.of_robot("upright")),
     )
     return learn(
         trial_keys(key, settings.trials),
@@ -110,7 +110,7 @@ def make_task(
         physics=PHYSICS[settings.physics],
         conditions=settings.conditions(),
         robot=settings.ranges().robot,
-        com=settings.com_method(),
+        com=settings.of_robot("com"),
     )
     if settings.constraint == PENALTY:
         return penalised(task, *settings.box(), PENALTY_SIZE)
@@ -181,7 +181,7 @@ def as_learned(settings: Settings, policy: LinearGaussian) -> Learned:
         "name": "walk",
         "balance": settings.balance()._asdict(),
         "robot": settings.ranges().robot.name,
-        "com": settings.com_method(),
+        "com": settings.of_robot("com"),
     }
     if is_spec(settings.robot):
         task["spec"] = robot_id(settings.robot)

@@ -83,9 +83,10 @@ class Settings:
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
         placement_gain: shift of the landing foot towards the side of the tilt, see `Balance`; 0 is the
             paper's engine.
-        filter_time: time constant of the filter for the measured tilt, s, see `Balance`; 0 is no filter.
+        filter_time: time constant of the filter for the measured tilt, s, see `Balance`; 0 is no filter. None
+            is 0 for a NAO and 0.06 for other robots.
         upright: share of the cost of a fall that is given back in learning in proportion to the time before
-            the fall; 0 is the paper's reward.
+            the fall; 0 is the paper's reward. None is 0 for a NAO and 0.5 for other robots.
         sampler: distribution of the contexts in learning: gaussian or uniform.
         margin: distance beyond both ends of the range in which contexts are also drawn in learning, m/s;
             without samples on both sides the ends are learned less well than the middle.
@@ -120,8 +121,8 @@ class Settings:
     learning_duration: float = 8.0
     heading_gain: float = 0.0
     placement_gain: float = 0.0
-    filter_time: float = 0.0
-    upright: float = 0.0
+    filter_time: float | None = None
+    upright: float | None = None
     sampler: str = "gaussian"
     margin: float = 0.0
     learning_noise: float = 1.0
@@ -145,7 +146,7 @@ class Settings:
     def resolved(self) -> "Settings":
         """Return the settings with a value in place of each None and "auto" that stands for one."""
         ranges = self.ranges()
-        own = {"low": ranges.low, "high": ranges.high, "com": self.com_method()}
+        own = {"low": ranges.low, "high": ranges.high, **self._of_robot()}
         if self.robot in BOUNDS:
             own["bounds"] = self.robot
         chosen: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name) is None}
@@ -162,9 +163,15 @@ class Settings:
         """Return the bounds of the parameters."""
         return self.ranges().bounds if self.bounds is None else BOUNDS[self.bounds]
 
-    def com_method(self) -> str:
-        """Return how the CoM is planned."""
-        return self.com or ("one_step" if self.robot in ROBOTS else "continuous")
+    def of_robot(self, name: str) -> Any:
+        """Return `com`, `filter_time` or `upright`, by default as it fits the robot."""
+        given = getattr(self, name)
+        return self._of_robot()[name] if given is None else given
+
+    def _of_robot(self) -> dict[str, Any]:
+        if self.robot in ROBOTS:
+            return {"com": "one_step", "filter_time": 0.0, "upright": 0.0}
+        return {"com": "continuous", "filter_time": 0.06, "upright": 0.5}
 
     def speeds(self, num: int = NUM_SPEEDS) -> np.ndarray:
         """Return `num` equally spaced speeds, m/s; by default, with the paper's robot, its 11 speeds."""
@@ -173,7 +180,7 @@ class Settings:
 
     def balance(self) -> Balance:
         """Return the gains of the response to the measured orientation."""
-        return Balance(self.heading_gain, self.placement_gain, self.filter_time)
+        return Balance(self.heading_gain, self.placement_gain, self.of_robot("filter_time"))
 
     def conditions(self) -> tuple[Condition, ...]:
         """Return the context variables after the speed."""
