@@ -1,10 +1,11 @@
 """Evaluate a walking policy at 11 speeds, with 50 new episodes each, and compare it with the paper's Table 2.
 
-    python -m experiments.benchmarks.policy [POLICY.npz] [--robot NAME] [--noise TIMES]
-                                            [--placement-gain GAIN] [--seed SEED]
+    python -m experiments.benchmarks.policy [POLICY.npz] [--robot NAME] [--speeds N] [--episodes N]
+                                            [--noise TIMES] [--placement-gain GAIN] [--seed SEED]
 
-Without a file the policy is the shipped one of the robot. The last options test a policy in more noise, or
-with another gain of the foot placement than it was learned with.
+Without a file the policy is the shipped one of the robot. `--robot` may be the .toml file that describes a
+humanoid. The last options test a policy in more noise, or with another gain of the foot placement than it was
+learned with.
 """
 
 import sys
@@ -24,7 +25,7 @@ from creps_jax.tools import tables
 from creps_jax.tools.command_line import answer
 from creps_jax.tools.play import balance_of, load_walking_policy, robot_of, shipped_policy
 from creps_jax.training import evaluate
-from experiments.walking.settings import NUM_SPEEDS
+from experiments.walking.settings import NUM_SPEEDS, PHYSICS
 
 SEEDS = 50
 
@@ -32,6 +33,8 @@ SEEDS = 50
 def main(
     policy: tyro.conf.Positional[Path | None] = None,
     robot: str | None = None,
+    speeds: int = NUM_SPEEDS,
+    episodes: int = SEEDS,
     noise: float = 1.0,
     placement_gain: float | None = None,
     seed: int = 2026,
@@ -40,7 +43,9 @@ def main(
 
     Args:
         policy: Policy file; the shipped one by default.
-        robot: Robot of the policy; by default the robot of the file, or nao.
+        robot: Robot of the policy, or the file that describes it; by default the robot of the policy, or nao.
+        speeds: Number of speeds, equally spaced over the range of the policy.
+        episodes: Number of episodes at each speed.
         noise: Factor of the usual noise.
         placement_gain: Gain of the foot placement; by default the one that the policy was learned with.
         seed: Seed of the noise.
@@ -49,24 +54,37 @@ def main(
     balance = balance_of(saved)
     if placement_gain is not None:
         balance = balance._replace(placement_gain=placement_gain)
-    task = nao_walk(robot=robot_of(saved), balance=balance, noise=WalkNoise().times(noise))
-    outcome = walk_at_all_speeds(saved, task, seed=seed)
-    print(
-        tables.to_markdown(tables.speed_table(speeds_of(saved), outcome.reward, outcome.speed, outcome.fell))
+    asked = speeds_of(saved, speeds)
+    task = nao_walk(
+        float(asked[0]),
+        float(asked[-1]),
+        robot=robot_of(saved, robot),
+        balance=balance,
+        noise=WalkNoise().times(noise),
+        physics=PHYSICS["auto"],
+        com=saved.task.get("com", "one_step"),
     )
-    print(f"mean reward {outcome.reward.mean():.4f}, falls {int(outcome.fell.sum())} of {outcome.fell.size}")
+    outcome = walk_at_all_speeds(saved, task, seed=seed, speeds=speeds, episodes=episodes)
+    print(tables.to_markdown(tables.speed_table(asked, outcome.reward, outcome.speed, outcome.fell)))
+    error = np.abs(outcome.speed[..., 0].mean(axis=1) - asked).max()
+    print(
+        f"mean reward {outcome.reward.mean():.4f}, falls {int(outcome.fell.sum())} of {outcome.fell.size}, "
+        f"largest error of the speed {error:.3f} m/s"
+    )
 
 
-def speeds_of(saved: Learned) -> np.ndarray:
-    """Return 11 speeds over the range of a policy, m/s; for the NAO the paper's."""
-    return np.linspace(saved.contexts.low[0], saved.contexts.high[0], NUM_SPEEDS, dtype=np.float32)
+def speeds_of(saved: Learned, num: int = NUM_SPEEDS) -> np.ndarray:
+    """Return equally spaced speeds over the range of a policy, m/s; by default, for the NAO, the paper's 11."""
+    return np.linspace(saved.contexts.low[0], saved.contexts.high[0], num, dtype=np.float32)
 
 
-def walk_at_all_speeds(saved: Learned, task: Task, *, seed: int) -> Any:
-    """Roll out a policy at 11 speeds; the outcome has axes (speeds, seeds)."""
-    speeds = speeds_of(saved)
-    thetas = jnp.stack([jnp.asarray(saved.theta(float(speed))) for speed in speeds])
-    outcome = evaluate(jax.random.key(seed), task, jnp.asarray(speeds)[:, None], thetas, repeats=SEEDS)
+def walk_at_all_speeds(
+    saved: Learned, task: Task, *, seed: int, speeds: int = NUM_SPEEDS, episodes: int = SEEDS
+) -> Any:
+    """Roll out a policy at several speeds; the outcome has axes (speeds, episodes)."""
+    asked = speeds_of(saved, speeds)
+    thetas = jnp.stack([jnp.asarray(saved.theta(float(speed))) for speed in asked])
+    outcome = evaluate(jax.random.key(seed), task, jnp.asarray(asked)[:, None], thetas, repeats=episodes)
     return jax.tree.map(np.asarray, outcome)
 
 
