@@ -381,7 +381,9 @@ def _check_kinematics(
             angles = rng.uniform(np.maximum(chain.lower, -1.5), np.minimum(chain.upper, 1.5)).astype(
                 np.float32
             )
-            theirs = _foot_pose(model, _posed(model, held, dict(zip(leg.joints, angles, strict=True))), leg)
+            theirs = _foot_pose(
+                model, _posed(model, held, dict(zip(leg.joints, angles.tolist(), strict=True))), leg
+            )
             error = np.abs(np.asarray(fk(jnp.asarray(angles))) - theirs @ T_foot_sole).max()
             if not error < _KINEMATICS_TOLERANCE:
                 raise ValueError(
