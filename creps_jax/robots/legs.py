@@ -12,7 +12,7 @@ from creps_jax.typing import Array, Float
 __all__ = ["solve_legs"]
 
 # Newton steps from the posture of standing, and from the joint angles of one control period before.
-_FIRST_ITERATIONS, _ITERATIONS = 30, 3
+FIRST_ITERATIONS, ITERATIONS = 30, 3
 
 
 def solve_legs(
@@ -36,7 +36,7 @@ def solve_legs(
     if not isinstance(robot, Humanoid):
         raise ValueError(f"robot must be a NaoRobot or a Humanoid, whose kinematics are known, got {robot!r}")
     posture = jnp.asarray(robot.posture, T_torso_left.dtype)
-    start, iterations = (posture, _FIRST_ITERATIONS) if last is None else (last, _ITERATIONS)
+    start, iterations = (posture, FIRST_ITERATIONS) if last is None else (last, ITERATIONS)
     left, right = (
         chain_ik(pose, start[jnp.array(joints)], chain, iterations=iterations)
         for pose, joints, chain in (

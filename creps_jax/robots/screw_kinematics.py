@@ -9,15 +9,15 @@ from jax import lax
 from creps_jax import checks
 from creps_jax.numerics.rotations import rigid_transform
 from creps_jax.robots.humanoid import LegChain
-from creps_jax.typing import Array, Float
+from creps_jax.typing import Array, Float, IntScalar
 
 __all__ = ["chain_fk", "chain_ik"]
 
 # Largest change of an angle in one iteration, rad.
-_LARGEST_STEP = 0.5
+LARGEST_STEP = 0.5
 # Damping for each unit of squared pose error, and at the solution. It bounds the steps out of reach and at a
 # straight leg; near a solution it vanishes, and the convergence is quadratic.
-_DAMPING, _LEAST_DAMPING = 1e-2, 1e-7
+DAMPING, LEAST_DAMPING = 1e-2, 1e-7
 
 
 @checks.arguments
@@ -67,9 +67,9 @@ def chain_ik(
     dtype = T_torso_sole.dtype
     lower, upper = jnp.asarray(chain.lower, dtype), jnp.asarray(chain.upper, dtype)
 
-    def newton(_: int, joint_pos: Float[Array, " k"]) -> Float[Array, " k"]:
+    def newton(_: IntScalar, joint_pos: Float[Array, " k"]) -> Float[Array, " k"]:
         step = _newton_step(joint_pos, T_torso_sole, chain)
-        return jnp.clip(joint_pos + jnp.clip(step, -_LARGEST_STEP, _LARGEST_STEP), lower, upper)
+        return jnp.clip(joint_pos + jnp.clip(step, -LARGEST_STEP, LARGEST_STEP), lower, upper)
 
     return lax.fori_loop(0, iterations, newton, jnp.clip(guess.astype(dtype), lower, upper))
 
@@ -81,12 +81,12 @@ def _newton_step(joint_pos: Array, T_torso_sole: Array, chain: LegChain) -> Arra
     turn = T_torso_sole[:3, :3] @ R_torso_sole.T
     about = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
     error = jnp.concatenate([(T_torso_sole[:3, 3] - position) / length, about])
-    jacobian = jnp.concatenate([jnp.cross(axes, position - points) / length, axes], axis=1).T
+    jacobian = jnp.concatenate([jnp.cross(axes, position[None] - points) / length, axes], axis=1).T
     # Weights are along the axes of the sole.
     to_sole = jnp.zeros((6, 6), error.dtype).at[:3, :3].set(R_torso_sole.T).at[3:, 3:].set(R_torso_sole.T)
     weighted = jnp.asarray(chain.weights, error.dtype)[:, None] * to_sole
     error, jacobian = weighted @ error, weighted @ jacobian
-    damping = _DAMPING * jnp.sum(error**2) + _LEAST_DAMPING
+    damping = DAMPING * jnp.sum(error**2) + LEAST_DAMPING
     return _solve(
         jacobian.T @ jacobian + damping * jnp.eye(len(joint_pos), dtype=error.dtype), jacobian.T @ error
     )

@@ -82,12 +82,18 @@ def _towards(step, wanted, growth: Scalar, spacing: float):
     return shrunk + jnp.clip(wanted - shrunk, -limit, limit)
 
 
-def _limit(seen, swing_side, share, robot):
-    """Limit a pose, seen from the support foot, to a share of the box in which the swing foot may land."""
+def landing_box(robot: Robot) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the ends of the box in which the left foot may land, seen from the right one, m and rad."""
     low, high = (
-        share * jnp.array([robot.size * ahead, robot.foot_spacing + robot.size * aside, turned], seen.dtype)
+        (robot.size * ahead, robot.foot_spacing + robot.size * aside, turned)
         for ahead, aside, turned in (LANDING_LOW, LANDING_HIGH)
     )
+    return low, high
+
+
+def _limit(seen, swing_side, share, robot):
+    """Limit a pose, seen from the support foot, to a share of the box in which the swing foot may land."""
+    low, high = (share * jnp.array(end, seen.dtype) for end in landing_box(robot))
     mirror = jnp.ones_like(seen).at[1].set(swing_side)
     return mirror * jnp.clip(mirror * seen, low, high)
 

@@ -1,6 +1,6 @@
 """Compare an exported walk in C with the same walk in Python: set-points, speed, falls, and time of a step.
 
-    python -m experiments.benchmarks.exported_walk [POLICY.npz] [--runs N]
+    python -m experiments.benchmarks.exported_walk [POLICY.npz] [--runs N] [--robot ROBOT]
 
 A robot in plain MuJoCo walks in closed loop, without noise, by commands that change. Without a file the
 policy is the shipped one that can be steered. Needs a C compiler, `cc`.
@@ -24,12 +24,13 @@ from creps_jax.errors import UserError
 from creps_jax.policies.learned import Learned
 from creps_jax.robots.robot import Robot
 from creps_jax.simulation.models import load_model
+from creps_jax.simulation.servos import read_servos
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tools import tables
 from creps_jax.tools.command_line import answer
 from creps_jax.tools.drive import default_policy
 from creps_jax.tools.export import walk_c
-from creps_jax.tools.play import load_walking_policy
+from creps_jax.tools.play import load_walking_policy, robot_of
 from creps_jax.walking.gaits import learned_walker
 
 COMPILER = shutil.which("cc")
@@ -46,22 +47,23 @@ Controller = Callable[[np.ndarray, tuple[float, float, float]], np.ndarray]
 class CompiledWalk:
     """The exported C code of a walk, compiled with all warnings as errors."""
 
-    def __init__(self, folder: Path, policy: Learned, period: float = CONTROL_PERIOD):
+    def __init__(self, folder: Path, policy: Learned, robot: Robot, period: float = CONTROL_PERIOD):
         if COMPILER is None:
             raise UserError("there is no C compiler, cc")
-        self._robot = learned_walker(policy).robot
-        walk_c.save(folder / "walk.c", policy, period=period)
+        self._robot = robot
+        walk_c.save(folder / "walk.c", policy, robot=robot, period=period)
         library = folder / "walk.so"
         command = [COMPILER, *STRICT, "-O2", "-shared", "-fPIC", folder / "walk.c", "-o", library, "-lm"]
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode != 0:
             raise UserError(f"{COMPILER} refuses the exported code: {done.stderr}")
         functions = ctypes.CDLL(str(library))
-        self._step = getattr(functions, f"{self._robot.name}_walk_step")
+        prefix = walk_c.prefix_of(robot, "walk")
+        self._step = getattr(functions, f"{prefix}_step")
         self._step.argtypes = [ctypes.c_void_p, ctypes.c_void_p, *[ctypes.c_float] * 3, ctypes.c_void_p]
         self._state = ctypes.create_string_buffer(8192)
-        self._out = np.zeros(len(self._robot.joint_lower), np.float32)
-        start = getattr(functions, f"{self._robot.name}_walk_start")
+        self._out = np.zeros(robot.num_joints, np.float32)
+        start = getattr(functions, f"{prefix}_start")
         start(self._state, ctypes.c_void_p(self._out.ctypes.data))
 
     @property
@@ -79,8 +81,8 @@ class CompiledWalk:
 class PythonWalk:
     """The same walk by the jitted `Walker.step`."""
 
-    def __init__(self, policy: Learned):
-        walker = learned_walker(policy)
+    def __init__(self, policy: Learned, robot: Robot):
+        walker = learned_walker(policy, robot=robot)
         self._step, self._state = jax.jit(walker.step), walker.start()
 
     @property
@@ -101,16 +103,15 @@ class Simulation:
         self._model = load_model(robot)
         self._data = mujoco.MjData(self._model)
         self._data.qpos[2] = robot.torso_height
-        self._data.qpos[7:] = set_point
+        self._data.qpos[read_servos(self._model).qpos_index] = set_point
         mujoco.mj_forward(self._model, self._data)
-        # Down until the lowest point of the feet is on the floor.
-        spheres = np.flatnonzero(self._model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE)
-        self._data.qpos[2] -= np.min(self._data.geom_xpos[spheres, 2] - self._model.geom_size[spheres, 0])
+        # Down until the lowest point of the robot is on the floor.
+        self._data.qpos[2] -= min(self._heights())
         self._last = set_point
         self._positions: list[np.ndarray] = []
 
     def walk(self, controller: Controller, commands: np.ndarray) -> np.ndarray:
-        """Walk by a controller: (command, rpy) -> set-points. Return all set-points (n, 22), rad."""
+        """Walk by a controller: (command, rpy) -> set-points. Return all set-points (n, nu), rad."""
         set_points = []
         for command in commands:
             set_points.append(controller(command, self._rpy()))
@@ -125,6 +126,16 @@ class Simulation:
         """Return the distance that the torso moves in each two seconds over the time, m/s."""
         positions = np.array(self._positions)[:: round(2.0 / CONTROL_PERIOD), :2]
         return np.linalg.norm(np.diff(positions, axis=0), axis=1) / 2.0
+
+    def _heights(self) -> list[float]:
+        """Return the height of the lowest point of each solid geom, m."""
+        model = self._model
+        is_solid = (model.geom_contype != 0) | (model.geom_conaffinity != 0)
+        is_floor = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        floor = int(np.flatnonzero(is_floor)[0])
+        solids = np.flatnonzero(is_solid & ~is_floor)
+        farthest = 10.0
+        return [mujoco.mj_geomDistance(model, self._data, floor, int(i), farthest, None) for i in solids]
 
     def _rpy(self) -> tuple[float, float, float]:
         w, x, y, z = self._data.qpos[3:7]
@@ -150,21 +161,22 @@ def changing_commands(num: int, seed: int = 0) -> np.ndarray:
     return commands.astype(np.float32)
 
 
-def main(policy: tyro.conf.Positional[Path | None] = None, runs: int = 5) -> None:
+def main(policy: tyro.conf.Positional[Path | None] = None, runs: int = 5, robot: str | None = None) -> None:
     """Measure a policy and print its table.
 
     Args:
         policy: Policy file; the shipped one by default.
         runs: Number of runs of 20 s, each with other commands.
+        robot: The robot of the policy, or the TOML file that describes it; by default the one it names.
     """
-    learned = load_walking_policy(policy or default_policy(), can_steer=True)
-    robot = learned_walker(learned).robot
+    learned = load_walking_policy(policy or default_policy(), robot, can_steer=True)
+    who = robot_of(learned, robot)
     columns: dict[str, list[object]] = {name: [] for name in _COLUMNS}
     with tempfile.TemporaryDirectory() as folder:
         for seed in range(runs):
             commands = changing_commands(round(SECONDS / CONTROL_PERIOD), seed)
-            walks = CompiledWalk(Path(folder), learned), PythonWalk(learned)
-            simulations = [Simulation(robot, walks[1].set_point) for _ in walks]
+            walks = CompiledWalk(Path(folder), learned, who), PythonWalk(learned, who)
+            simulations = [Simulation(who, walks[1].set_point) for _ in walks]
             found = [each.walk(walk.step, commands) for each, walk in zip(simulations, walks, strict=True)]
             parts = np.abs(found[0] - found[1]).max(axis=1) > EQUAL
             row = [
@@ -175,8 +187,8 @@ def main(policy: tyro.conf.Positional[Path | None] = None, runs: int = 5) -> Non
             for name, value in zip(_COLUMNS, row, strict=True):
                 columns[name].append(value)
         print(tables.to_markdown(columns))
-        in_c = 1e6 * _time_of_step(CompiledWalk(Path(folder), learned).step)
-        in_python = 1e6 * _time_of_step(PythonWalk(learned).step)
+        in_c = 1e6 * _time_of_step(CompiledWalk(Path(folder), learned, who).step)
+        in_python = 1e6 * _time_of_step(PythonWalk(learned, who).step)
         print(
             f"one control step, with its call from Python: C {in_c:.0f} us, jitted Python {in_python:.0f} us"
         )

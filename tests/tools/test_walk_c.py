@@ -2,6 +2,9 @@
 
 import dataclasses
 import subprocess
+from importlib import resources
+from importlib.util import find_spec
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +12,14 @@ import numpy as np
 import pytest
 from jax import lax
 
+from creps_jax.errors import UserError
 from creps_jax.files import policies_folder
 from creps_jax.policies.features import polynomial_features
 from creps_jax.policies.learned import load
 from creps_jax.policies.space import Space
+from creps_jax.robots.mjcf import humanoid_from_mjcf
 from creps_jax.robots.nao_geometry import JOINT_NAMES
-from creps_jax.robots.robot import NAO, NAO_H25
+from creps_jax.robots.robot import NAO, NAO_H25, Robot
 from creps_jax.tools.export import walk_c
 from creps_jax.walking.gaits import learned_walker
 from experiments.benchmarks.exported_walk import (
@@ -25,6 +30,7 @@ from experiments.benchmarks.exported_walk import (
     Simulation,
     changing_commands,
 )
+from tests.tools.offset_humanoid import make_humanoid, scaled_walk
 
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
 WALKS = {
@@ -58,6 +64,26 @@ def with_friction(policy):
     return dataclasses.replace(wider, policy=policy.policy._replace(coef=jnp.asarray(coef, jnp.float32)))
 
 
+def assert_equal_walks(policy, robot, period, seconds, folder):
+    """Compare C with Python over a walk whose commands and measurements change."""
+    num = round(seconds / period)
+    commands = changing_commands(num)
+    rpy = 0.1 * np.cumsum(np.random.default_rng(1).normal(0.0, 0.01, (num, 3)), axis=0)
+    rpy[:, 2] = np.linspace(0.0, 9.0, num)  # more than one turn
+    walker = learned_walker(policy, robot=robot, period=period)
+
+    def step(state, now):
+        state, set_point = walker.step(state, *now)
+        return state, set_point
+
+    given = jnp.asarray(commands), jnp.asarray(rpy, jnp.float32)
+    wanted = np.asarray(jax.jit(lambda given: lax.scan(step, walker.start(), given)[1])(given))
+    code = CompiledWalk(folder, policy, robot, period)
+    np.testing.assert_allclose(code.set_point, walker.start().set_point, atol=1e-5)
+    found = np.array([code.step(*now) for now in zip(commands, rpy, strict=True)])
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
+
+
 @needs_compiler
 @pytest.mark.parametrize("period", [0.02, 0.012])
 @pytest.mark.parametrize("walk", [*WALKS, "steered with a condition"])
@@ -67,29 +93,60 @@ def test_set_points_are_those_of_python(walk, period, tmp_path):
     policy = policy_of(*WALKS[walk.removesuffix(" with a condition")])
     if walk.endswith("with a condition"):
         policy = with_friction(policy)
-    num = round(20.0 / period)
-    commands = changing_commands(num)
-    rpy = 0.1 * np.cumsum(np.random.default_rng(1).normal(0.0, 0.01, (num, 3)), axis=0)
-    rpy[:, 2] = np.linspace(0.0, 9.0, num)  # more than one turn
-    walker = learned_walker(policy, period=period)
+    assert_equal_walks(policy, NAO_H25 if walk == "real NAO" else NAO, period, 20.0, tmp_path)
 
-    def step(state, now):
-        state, set_point = walker.step(state, *now)
-        return state, set_point
 
-    given = jnp.asarray(commands), jnp.asarray(rpy, jnp.float32)
-    wanted = np.asarray(jax.jit(lambda given: lax.scan(step, walker.start(), given)[1])(given))
-    code = CompiledWalk(tmp_path, policy, period)
-    np.testing.assert_allclose(code.set_point, walker.start().set_point, atol=1e-5)
-    found = np.array([code.step(*now) for now in zip(commands, rpy, strict=True)])
-    np.testing.assert_allclose(found, wanted, atol=1e-4)
+@needs_compiler
+@pytest.mark.parametrize("num_leg_joints", [6, 5])
+@pytest.mark.parametrize("walk", ["walk", "steer"])
+def test_set_points_of_a_humanoid_are_those_of_python(walk, num_leg_joints, tmp_path):
+    robot = make_humanoid(tmp_path, num_leg_joints)
+    com = "one_step" if walk == "walk" else "continuous"
+    assert_equal_walks(scaled_walk(robot, com, walk), robot, 0.02, 8.0, tmp_path)
+
+
+@needs_compiler
+@pytest.mark.skipif(find_spec("rcsssmj") is None, reason="the package rcsssmj is not installed")
+def test_set_points_of_the_k1_are_those_of_python(tmp_path):
+    leg = ("Hip_Pitch", "Hip_Roll", "Hip_Yaw", "Knee_Pitch", "Ankle_Pitch", "Ankle_Roll")
+    robot = humanoid_from_mjcf(
+        Path(str(resources.files("rcsssmj"))) / "resources" / "robots" / "K1" / "robot.xml",
+        name="k1",
+        left_leg=[f"Left_{joint}" for joint in leg],
+        right_leg=[f"Right_{joint}" for joint in leg],
+        feet=["left_foot_link", "right_foot_link"],
+        held={"Left_Shoulder_Roll": -1.35, "Right_Shoulder_Roll": 1.35},
+    )
+    assert_equal_walks(scaled_walk(robot), robot, 0.02, 8.0, tmp_path)
+
+
+@needs_compiler
+def test_names_of_any_characters_can_be_compiled(tmp_path):
+    robot = make_humanoid(tmp_path)
+    names = tuple(f'{name} "\\' for name in robot.joint_names)
+    robot = dataclasses.replace(robot, name="2nd */ robot", own_names=names)
+    code = CompiledWalk(tmp_path, scaled_walk(robot), robot)
+    assert np.isfinite(code.step((0.1, 0.0, 0.0), (0.0, 0.0, 0.0))).all()
+    assert "robot_2nd_robot_walk_step" in (tmp_path / "walk.h").read_text()
+
+
+def test_the_robot_must_be_that_of_the_policy(tmp_path):
+    robot = make_humanoid(tmp_path)
+    policy = scaled_walk(robot)
+    with pytest.raises(UserError, match=r"robot must be the Robot 'offset-humanoid'.*got no robot"):
+        walk_c.make_walk(policy)
+    with pytest.raises(UserError, match=r"robot must be 'offset-humanoid'.*got 'nao'"):
+        walk_c.make_walk(policy, robot=NAO)
+    fields = {field.name: getattr(robot, field.name) for field in dataclasses.fields(Robot)}
+    with pytest.raises(UserError, match="robot must be a NaoRobot or a Humanoid"):
+        walk_c.make_walk(policy, robot=Robot(**fields))
 
 
 @needs_compiler
 def test_a_pause_of_the_measurements_is_bridged(tmp_path):
     """The robot goes on with the tilt that was measured last, and with the planned heading."""
     policy = policy_of(*WALKS["steered"])
-    paused, measured = (CompiledWalk(tmp_path, policy) for _ in range(2))
+    paused, measured = (CompiledWalk(tmp_path, policy, NAO) for _ in range(2))
     command, still, missing = (0.2, 0.0, 0.4), (0.02, 0.05, 0.0), (float("nan"),) * 3
     for tick in range(200):
         # Sway up to the pause.
@@ -105,9 +162,9 @@ def test_a_pause_of_the_measurements_is_bridged(tmp_path):
 def test_a_simulated_robot_walks_by_the_c_code_in_closed_loop(tmp_path):
     policy = policy_of(*WALKS["steered"])
     commands = changing_commands(1000, seed=3)
-    walks = CompiledWalk(tmp_path, policy), PythonWalk(policy)
+    walks = CompiledWalk(tmp_path, policy, NAO), PythonWalk(policy, NAO)
     first = walks[1].set_point
-    in_c, in_python = (Simulation(learned_walker(policy).robot, first) for _ in walks)
+    in_c, in_python = (Simulation(NAO, first) for _ in walks)
     by_c, by_python = in_c.walk(walks[0].step, commands), in_python.walk(walks[1].step, commands)
 
     # Contacts enlarge rounding errors: until then the set-points are equal, and after it the walks are alike.

@@ -99,7 +99,7 @@ def _enum(tag: str, names: Sequence[str]) -> str:
 
 
 def _strings(declarator: str, values: Iterable[str]) -> str:
-    return f"static const char *const {declarator} = {{{_lines(map(_string, values))}}};\n"
+    return f"static const char *const {declarator} = {{{_lines(map(string_literal, values))}}};\n"
 
 
 def floats(declarator: str, values: np.ndarray) -> str:
@@ -116,7 +116,7 @@ def _lines(items: Iterable[str]) -> str:
     return "\n" + textwrap.indent(",\n".join(items), "    ") + "\n"
 
 
-def _string(text: str) -> str:
+def string_literal(text: str) -> str:
     """Return a C string literal: other than plain characters as octal numbers of their UTF-8 bytes."""
     return '"' + "".join(chr(b) if chr(b) in _PLAIN else f"\\{b:03o}" for b in text.encode()) + '"'
 

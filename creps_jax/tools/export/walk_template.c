@@ -5,6 +5,7 @@
 #include "@HEADER@"
 
 #include <math.h>
+#include <stddef.h>
 
 #define PI 3.14159265358979f
 #define NODES WALK_NUM_NODES
@@ -64,11 +65,17 @@ static void relative_pose(const float pose[3], const float other[3], float resul
     result[1] = c * y - s * x;
 }
 
-/* ---- rotations and the leg ---- */
+/* ---- rotations ---- */
 
 typedef struct {
     float m[3][3];
 } matrix;
+
+/* A sole in the frame of the trunk. */
+typedef struct {
+    matrix rotation;
+    float position[3];
+} sole_pose;
 
 static matrix product(const matrix *a, const matrix *b)
 {
@@ -126,6 +133,9 @@ static matrix rotation_z(float angle)
     return r;
 }
 
+/* ---- the legs ---- */
+
+#if IS_NAO
 /* Knee and ankle pitch for a position of the hip ahead of and above the ankle pitch axis. */
 static void solve_plane(float hip_x, float hip_z, float *knee, float *ankle_pitch)
 {
@@ -141,23 +151,23 @@ static void solve_plane(float hip_x, float hip_z, float *knee, float *ankle_pitc
 
 static void hip_position(float side, float result[3])
 {
-    result[0] = HIP_X;
+    result[0] = HIP_CENTRE[0];
     result[1] = side * HIP_Y;
-    result[2] = HIP_Z;
+    result[2] = HIP_CENTRE[1];
 }
 
-/* Joint angles of a leg for a pose of its sole in the frame of the torso. */
-static void leg_ik(const matrix *sole, const float position[3], float side, float joints[6])
+/* Joint angles of a leg for a pose of its sole, in closed form. */
+static void leg_ik(const sole_pose *sole, float side, float joints[6])
 {
     const float fold = 0.003f, tilt = side * PI / 4.0f;
-    const matrix inverse = transposed(sole);
+    const matrix inverse = transposed(&sole->rotation);
     float hip[3], x[3], height, in_plane, knee, ankle_pitch, ankle_roll, first, second, third, c, s;
     matrix a, b, r;
     int i;
 
     hip_position(side, hip);
     for (i = 0; i < 3; ++i) {
-        hip[i] -= position[i];
+        hip[i] -= sole->position[i];
     }
     rotated(&inverse, hip, x);
     x[2] -= FOOT_DOWN;
@@ -167,7 +177,7 @@ static void leg_ik(const matrix *sole, const float position[3], float side, floa
     solve_plane(x[0], in_plane - ANKLE_DROP, &knee, &ankle_pitch);
 
     a = rotation_x(-ankle_roll);
-    r = product(sole, &a);
+    r = product(&sole->rotation, &a);
     a = rotation_y(knee + ankle_pitch);
     r = product(&r, &a);
     b = rotation_x(-tilt);
@@ -187,11 +197,10 @@ static void leg_ik(const matrix *sole, const float position[3], float side, floa
 
 #if ONE_YAW_MOTOR
 /* The same for a given hip yaw-pitch, which turns the sole in its plane. */
-static void leg_ik_with_yaw(
-    const matrix *sole, const float position[3], float side, float yaw_pitch, float joints[6])
+static void leg_ik_with_yaw(const sole_pose *sole, float side, float yaw_pitch, float joints[6])
 {
     const float tilt = side * PI / 4.0f;
-    const float up[3] = {sole->m[0][2], sole->m[1][2], sole->m[2][2]};
+    const float up[3] = {sole->rotation.m[0][2], sole->rotation.m[1][2], sole->rotation.m[2][2]};
     float hip[3], ankle[3], p[3], hip_roll, knee, square, ankle_pitch;
     matrix a, pelvis, shank, inverse;
     int i;
@@ -203,7 +212,7 @@ static void leg_ik_with_yaw(
     pelvis = product(&pelvis, &a);
     hip_position(side, hip);
     for (i = 0; i < 3; ++i) {
-        ankle[i] = position[i] + FOOT_DOWN * up[i] - hip[i];
+        ankle[i] = sole->position[i] + FOOT_DOWN * up[i] - hip[i];
     }
     inverse = transposed(&pelvis);
     rotated(&inverse, ankle, p);
@@ -222,6 +231,201 @@ static void leg_ik_with_yaw(
     joints[3] = knee;
     joints[4] = ankle_pitch;
     joints[5] = atan2f(-p[1], cosf(ankle_pitch) * p[2] - sinf(ankle_pitch) * p[0]);
+}
+#endif
+
+/* Write the joint angles of both legs, left and right, for the poses of their soles. */
+static void solve_legs(const sole_pose soles[2], const float last[], float joints[])
+{
+    float left[6], right[6];
+    int i;
+    (void)last;
+    leg_ik(&soles[0], 1.0f, left);
+    leg_ik(&soles[1], -1.0f, right);
+#if ONE_YAW_MOTOR
+    {
+        const float shared = clip(0.5f * (left[0] + right[0]), SHARED_YAW_LOW, SHARED_YAW_HIGH);
+        leg_ik_with_yaw(&soles[0], 1.0f, shared, left);
+        leg_ik_with_yaw(&soles[1], -1.0f, shared, right);
+    }
+#endif
+    for (i = 0; i < 6; ++i) {
+        joints[LEFT_LEG[i]] = left[i];
+        joints[RIGHT_LEG[i]] = right[i];
+    }
+}
+#else
+/* A leg by its joint axes from hip to ankle, with all its angles zero, in the frame of the trunk. */
+typedef struct {
+    const int *joints;                                  /* index of each in a joint vector */
+    const float (*axes)[3], (*points)[3], (*sole)[4];
+    const float *low, *high;                            /* limits of the angles, rad */
+    const float *weights;                               /* of errors along and about x, y, z of the sole */
+} leg_chain;
+
+static const leg_chain LEGS[2] = {
+    {LEFT_LEG, LEFT_AXES, LEFT_POINTS, LEFT_SOLE, LEFT_LOW, LEFT_HIGH, LEFT_WEIGHTS},
+    {RIGHT_LEG, RIGHT_AXES, RIGHT_POINTS, RIGHT_SOLE, RIGHT_LOW, RIGHT_HIGH, RIGHT_WEIGHTS},
+};
+
+/* Return the rotation about a unit axis. */
+static matrix rotation_about(const float axis[3], float angle)
+{
+    const matrix cross = {{{0.0f, -axis[2], axis[1]}, {axis[2], 0.0f, -axis[0]}, {-axis[1], axis[0], 0.0f}}};
+    const float s = sinf(angle), versine = 1.0f - cosf(angle);
+    matrix r = product(&cross, &cross);
+    int i, j;
+    for (i = 0; i < 3; ++i) {
+        for (j = 0; j < 3; ++j) {
+            r.m[i][j] = (i == j ? 1.0f : 0.0f) + s * cross.m[i][j] + versine * r.m[i][j];
+        }
+    }
+    return r;
+}
+
+/* Compute the pose of the sole at the angles of a leg, and there each joint's axis and a point on it. */
+static void leg_fk(
+    const leg_chain *leg, const float angles[NUM_LEG_JOINTS], sole_pose *sole, float axes[NUM_LEG_JOINTS][3],
+    float points[NUM_LEG_JOINTS][3])
+{
+    matrix rotation = {{{1.0f, 0.0f, 0.0f}, {0.0f, 1.0f, 0.0f}, {0.0f, 0.0f, 1.0f}}}, turned;
+    float shift[3] = {0.0f, 0.0f, 0.0f}, place[3];
+    int joint, i, j;
+    for (joint = 0; joint < NUM_LEG_JOINTS; ++joint) {
+        rotated(&rotation, leg->axes[joint], axes[joint]);
+        rotated(&rotation, leg->points[joint], points[joint]);
+        turned = rotation_about(leg->axes[joint], angles[joint]);
+        rotation = product(&rotation, &turned);
+        rotated(&rotation, leg->points[joint], place);
+        for (i = 0; i < 3; ++i) {
+            points[joint][i] += shift[i];
+            shift[i] = points[joint][i] - place[i];
+        }
+    }
+    for (i = 0; i < 3; ++i) {
+        place[i] = leg->sole[i][3];
+        for (j = 0; j < 3; ++j) {
+            turned.m[i][j] = leg->sole[i][j];
+        }
+    }
+    sole->rotation = product(&rotation, &turned);
+    rotated(&rotation, place, sole->position);
+    for (i = 0; i < 3; ++i) {
+        sole->position[i] += shift[i];
+    }
+}
+
+/* Weight a displacement and a rotation along and about the axes of the sole. */
+static void weigh(
+    const leg_chain *leg, const matrix *to_sole, const float along[3], const float about[3], float result[6])
+{
+    int i;
+    rotated(to_sole, along, result);
+    rotated(to_sole, about, result + 3);
+    for (i = 0; i < 6; ++i) {
+        result[i] *= leg->weights[i];
+    }
+}
+
+static float dot6(const float a[6], const float b[6])
+{
+    float sum = 0.0f;
+    int i;
+    for (i = 0; i < 6; ++i) {
+        sum += a[i] * b[i];
+    }
+    return sum;
+}
+
+/* Solve a positive definite system by Cholesky's method, in place. */
+static void solve_positive(float a[NUM_LEG_JOINTS][NUM_LEG_JOINTS], float x[NUM_LEG_JOINTS])
+{
+    int i, j, k;
+    for (i = 0; i < NUM_LEG_JOINTS; ++i) {
+        for (j = 0; j <= i; ++j) {
+            for (k = 0; k < j; ++k) {
+                a[i][j] -= a[i][k] * a[j][k];
+            }
+            a[i][j] = i == j ? sqrtf(a[i][i]) : a[i][j] / a[j][j];
+        }
+        for (k = 0; k < i; ++k) {
+            x[i] -= a[i][k] * x[k];
+        }
+        x[i] /= a[i][i];
+    }
+    for (i = NUM_LEG_JOINTS - 1; i >= 0; --i) {
+        for (k = i + 1; k < NUM_LEG_JOINTS; ++k) {
+            x[i] -= a[k][i] * x[k];
+        }
+        x[i] /= a[i][i];
+    }
+}
+
+/* Compute the damped Newton step for the error of the pose, lengths relative to that of the leg. */
+static void newton_step(
+    const leg_chain *leg, const sole_pose *wanted, const float angles[NUM_LEG_JOINTS], float step[NUM_LEG_JOINTS])
+{
+    const float length = fabsf(leg->sole[2][3] - leg->points[0][2]);
+    float axes[NUM_LEG_JOINTS][3], points[NUM_LEG_JOINTS][3], columns[NUM_LEG_JOINTS][6];
+    float normal[NUM_LEG_JOINTS][NUM_LEG_JOINTS], along[3], about[3], error[6], damping;
+    sole_pose sole;
+    matrix to_sole, turn;
+    int i, j;
+
+    leg_fk(leg, angles, &sole, axes, points);
+    to_sole = transposed(&sole.rotation);
+    turn = product(&wanted->rotation, &to_sole);
+    for (i = 0; i < 3; ++i) {
+        along[i] = (wanted->position[i] - sole.position[i]) / length;
+    }
+    about[0] = 0.5f * (turn.m[2][1] - turn.m[1][2]);
+    about[1] = 0.5f * (turn.m[0][2] - turn.m[2][0]);
+    about[2] = 0.5f * (turn.m[1][0] - turn.m[0][1]);
+    weigh(leg, &to_sole, along, about, error);
+    for (j = 0; j < NUM_LEG_JOINTS; ++j) {
+        const float *axis = axes[j];
+        for (i = 0; i < 3; ++i) {
+            about[i] = (sole.position[i] - points[j][i]) / length;
+        }
+        along[0] = axis[1] * about[2] - axis[2] * about[1];
+        along[1] = axis[2] * about[0] - axis[0] * about[2];
+        along[2] = axis[0] * about[1] - axis[1] * about[0];
+        weigh(leg, &to_sole, along, axis, columns[j]);
+    }
+    damping = DAMPING * dot6(error, error) + LEAST_DAMPING;
+    for (i = 0; i < NUM_LEG_JOINTS; ++i) {
+        for (j = 0; j < NUM_LEG_JOINTS; ++j) {
+            normal[i][j] = dot6(columns[i], columns[j]) + (i == j ? damping : 0.0f);
+        }
+        step[i] = dot6(columns[i], error);
+    }
+    solve_positive(normal, step);
+}
+
+/* Write the joint angles of both legs, left and right, for the poses of their soles: Newton steps from the
+ * joint angles one period before, or from the posture of standing if there are none. */
+static void solve_legs(const sole_pose soles[2], const float last[], float joints[])
+{
+    const float *start = last ? last : POSTURE;
+    const int iterations = last ? ITERATIONS : FIRST_ITERATIONS;
+    int side, iteration, i;
+    for (side = 0; side < 2; ++side) {
+        const leg_chain *leg = &LEGS[side];
+        float angles[NUM_LEG_JOINTS], step[NUM_LEG_JOINTS];
+        for (i = 0; i < NUM_LEG_JOINTS; ++i) {
+            angles[i] = clip(start[leg->joints[i]], leg->low[i], leg->high[i]);
+        }
+        for (iteration = 0; iteration < iterations; ++iteration) {
+            newton_step(leg, &soles[side], angles, step);
+            for (i = 0; i < NUM_LEG_JOINTS; ++i) {
+                angles[i] = clip(
+                    angles[i] + clip(step[i], -LARGEST_JOINT_STEP, LARGEST_JOINT_STEP), leg->low[i], leg->high[i]);
+            }
+        }
+        for (i = 0; i < NUM_LEG_JOINTS; ++i) {
+            joints[leg->joints[i]] = angles[i];
+        }
+    }
 }
 #endif
 
@@ -336,9 +540,7 @@ static void limit_landing(float seen[3], float swing_side, float share)
     int i;
     for (i = 0; i < 3; ++i) {
         const float mirror = i == 1 ? swing_side : 1.0f;
-        const float offset = i == 1 ? FOOT_SPACING : 0.0f;
-        const float low = share * (offset + LANDING_LOW[i]), high = share * (offset + LANDING_HIGH[i]);
-        seen[i] = mirror * clip(mirror * seen[i], low, high);
+        seen[i] = mirror * clip(mirror * seen[i], share * LANDING_LOW[i], share * LANDING_HIGH[i]);
     }
 }
 
@@ -650,22 +852,23 @@ static void pose_body(const walk_state *state, body_pose *pose)
 
 /* The pose of a sole in the frame of a trunk that leans about the middle of its hips. */
 static void sole_in_torso(
-    const float hips[4], const float sole[4], const matrix *trunk_level, float turn, float aside,
-    matrix *rotation, float position[3])
+    const float hips[4], const float foot[4], const matrix *trunk_level, float turn, float aside, sole_pose *sole)
 {
-    const matrix heading = rotation_z(turn - hips[3]), foot = rotation_z(sole[3]);
-    const float offset[3] = {sole[0] - hips[0], sole[1] - hips[1], sole[2] - hips[2]};
+    const matrix heading = rotation_z(turn - hips[3]), yaw = rotation_z(foot[3]);
+    const float offset[3] = {foot[0] - hips[0], foot[1] - hips[1], foot[2] - hips[2]};
     float level[3];
     rotated(&heading, offset, level);
     level[1] += aside;
-    rotated(trunk_level, level, position);
-    position[0] += HIP_X;
-    position[2] += HIP_Z;
-    *rotation = product(trunk_level, &heading);
-    *rotation = product(rotation, &foot);
+    rotated(trunk_level, level, sole->position);
+    sole->position[0] += HIP_CENTRE[0];
+    sole->position[2] += HIP_CENTRE[1];
+    sole->rotation = product(trunk_level, &heading);
+    sole->rotation = product(&sole->rotation, &yaw);
 }
 
-static void pose_joints(const walk_state *state, const body_pose *pose, const float measured[3], float joints[])
+/* Compute the joint targets; `last` are those of one period before, NULL if there are none. */
+static void pose_joints(
+    const walk_state *state, const body_pose *pose, const float measured[3], const float last[], float joints[])
 {
     const float *params = state->params;
     const float roll_seen = clip(measured[0], -MAX_MEASURED, MAX_MEASURED);
@@ -678,34 +881,17 @@ static void pose_joints(const walk_state *state, const body_pose *pose, const fl
     const float aside = -PLACEMENT_GAIN * params[HIP_HEIGHT] * tilt;
     const float ahead = 0.5f * (cosf(pose->hips[3]) * (pose->left[0] - pose->right[0])
         + sinf(pose->hips[3]) * (pose->left[1] - pose->right[1]));
-    const float swing = ARM_SWING * ahead;
-    const float arms[10] = {
-        0.0f, 0.0f, SHOULDER_PITCH - swing, SHOULDER_YAW, -ARM_ROLL, -ELBOW,
-        SHOULDER_PITCH + swing, -SHOULDER_YAW, ARM_ROLL, ELBOW};
-    matrix level_trunk, trunk_level, a, left, right;
-    float left_position[3], right_position[3];
+    const matrix about_x = rotation_x(roll), about_y = rotation_y(pitch);
+    const matrix level_trunk = product(&about_y, &about_x), trunk_level = transposed(&level_trunk);
+    sole_pose soles[2];
     int i;
 
-    a = rotation_x(roll);
-    level_trunk = rotation_y(pitch);
-    level_trunk = product(&level_trunk, &a);
-    trunk_level = transposed(&level_trunk);
-    sole_in_torso(
-        pose->hips, pose->left, &trunk_level, turn, aside * (0.5f + pose->turn), &left, left_position);
-    sole_in_torso(
-        pose->hips, pose->right, &trunk_level, -turn, aside * (0.5f - pose->turn), &right, right_position);
-    for (i = 0; i < 10; ++i) {
-        joints[i] = arms[i];
+    sole_in_torso(pose->hips, pose->left, &trunk_level, turn, aside * (0.5f + pose->turn), &soles[0]);
+    sole_in_torso(pose->hips, pose->right, &trunk_level, -turn, aside * (0.5f - pose->turn), &soles[1]);
+    for (i = 0; i < WALK_NUM_JOINTS; ++i) {
+        joints[i] = POSTURE[i] + ARM_SWING[i] * ahead;
     }
-    leg_ik(&left, left_position, 1.0f, joints + 10);
-    leg_ik(&right, right_position, -1.0f, joints + 16);
-#if ONE_YAW_MOTOR
-    {
-        const float shared = clip(0.5f * (joints[10] + joints[16]), SHARED_YAW_LOW, SHARED_YAW_HIGH);
-        leg_ik_with_yaw(&left, left_position, 1.0f, shared, joints + 10);
-        leg_ik_with_yaw(&right, right_position, -1.0f, shared, joints + 16);
-    }
-#endif
+    solve_legs(soles, last, joints);
     for (i = 0; i < WALK_NUM_JOINTS; ++i) {
         joints[i] = clip(joints[i], JOINT_LOW[i], JOINT_HIGH[i]);
     }
@@ -759,7 +945,7 @@ void walk_start(walk_state *state, float out[WALK_NUM_JOINTS])
     upright[1] = state->tilt[1];
     upright[2] = 0.0f;
     pose_body(state, &pose);
-    pose_joints(state, &pose, upright, state->set_point);
+    pose_joints(state, &pose, upright, NULL, state->set_point);
     write_out(state, out);
 }
 
@@ -799,7 +985,7 @@ void walk_step(
     measured[1] = state->tilt[1];
     measured[2] = wrapped(yaw - state->origin[2]);
     pose_body(state, &pose);
-    pose_joints(state, &pose, measured, target);
+    pose_joints(state, &pose, measured, state->set_point, target);
     for (i = 0; i < WALK_NUM_JOINTS; ++i) {
         const float farthest = MAX_JOINT_SPEED[i] * WALK_PERIOD;
         state->set_point[i] += clip(target[i] - state->set_point[i], -farthest, farthest);
