@@ -1,7 +1,9 @@
 """A small humanoid whose joint axes do not meet, and a walk for it."""
 
 import dataclasses
+import json
 from pathlib import Path
+from typing import Any
 
 from creps_jax.files import policies_folder
 from creps_jax.policies.learned import Learned, load
@@ -12,6 +14,7 @@ from creps_jax.robots.robot import Robot
 from creps_jax.walking.params import scaled_bounds
 
 JOINTS = ("hip_yaw", "hip_roll", "hip_pitch", "knee", "ankle_pitch", "ankle_roll")
+_SIDES = {"left": 1, "right": -1}
 
 _LEG = """
 <body name="{side}_thigh" pos="0 {y} -0.1">
@@ -54,27 +57,44 @@ _ROBOT = """
 
 def make_humanoid(folder: Path, num_leg_joints: int = 6) -> Humanoid:
     """Write the model and read the robot; legs of five joints have no ankle roll."""
-    names = JOINTS[:num_leg_joints]
-    sides = {"left": 1, "right": -1}
+    return humanoid_from_mjcf(_write_model(folder, num_leg_joints), **_description(num_leg_joints))
+
+
+def write_spec(folder: Path) -> Path:
+    """Write the model and the TOML file that describes the robot."""
+    _write_model(folder, 6)
+    lines = ['model = "model.xml"']
+    for key, value in _description(6).items():
+        is_table = isinstance(value, dict)
+        lines.append(f"{key} = {{ neck = {value['neck']} }}" if is_table else f"{key} = {json.dumps(value)}")
+    path = folder / "robot.toml"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def _write_model(folder: Path, num_leg_joints: int) -> Path:
     legs = "".join(
         _LEG.replace("{ankle_roll}", _ANKLE_ROLL if num_leg_joints == 6 else "").format(
             side=side, sign=sign, y=0.06 * sign
         )
-        for side, sign in sides.items()
+        for side, sign in _SIDES.items()
     )
-    joints = ["neck", *(f"{side}_{name}" for side in sides for name in names)]
+    joints = ["neck", *(f"{side}_{name}" for side in _SIDES for name in JOINTS[:num_leg_joints])]
     motors = "".join(f'<motor joint="{joint}" ctrllimited="true" ctrlrange="-20 20"/>' for joint in joints)
     path = folder / "model.xml"
     path.write_text(_ROBOT.format(legs=legs, motors=motors))
-    return humanoid_from_mjcf(
-        path,
-        name="offset-humanoid",
-        left_leg=[f"left_{name}" for name in names],
-        right_leg=[f"right_{name}" for name in names],
-        feet=["left_foot", "right_foot"],
-        held={"neck": 0.1},
-        arm_swing={"neck": 2.0},
-    )
+    return path
+
+
+def _description(num_leg_joints: int) -> dict[str, Any]:
+    legs = {f"{side}_leg": [f"{side}_{name}" for name in JOINTS[:num_leg_joints]] for side in _SIDES}
+    return {
+        "name": "offset-humanoid",
+        **legs,
+        "feet": ["left_foot", "right_foot"],
+        "held": {"neck": 0.1},
+        "arm_swing": {"neck": 2.0},
+    }
 
 
 def scaled_walk(robot: Robot, com: str = "continuous", name: str = "walk") -> Learned:

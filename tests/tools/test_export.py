@@ -29,8 +29,10 @@ from creps_jax.robots.robot import NAO_H25
 from creps_jax.tools.cli import main
 from creps_jax.tools.export.c_header import make_header
 from creps_jax.tools.export.onnx_model import make_model
+from creps_jax.tools.robots import find_robot
 from creps_jax.walking.gaits import learned_walker
 from creps_jax.walking.open_loop import open_loop_walk
+from tests.tools.offset_humanoid import scaled_walk, write_spec
 
 NAMES = ("a b", "a-b", 'what?? "\\')
 SHIPPED = policies_folder() / "walk.npz"
@@ -319,6 +321,29 @@ def test_a_robot_gets_its_own_policy_and_set_points(folder, capsys):
     np.testing.assert_allclose(left, right, atol=1e-6)
     assert main(["export", "--robot", "nao_h25", "--to", "h25.h"]) == 0
     assert (folder / "h25.h").read_text() == make_header(load(shipped), "h25")
+
+
+def test_the_walk_of_a_humanoid_is_written(folder, capsys):
+    spec = write_spec(folder)
+    robot = find_robot(str(spec)).robot
+    save(folder / "humanoid.npz", scaled_walk(robot))
+    asked = ["export", "--robot", spec.name, "--policy", "humanoid.npz"]
+    assert main([*asked, "--to", "walk.csv", "--speed", "0.3", "--duration", "1"]) == 0
+    assert main([*asked, "--to", "walk.c"]) == 0
+    assert "offset_humanoid_walk_step" in (folder / "walk.h").read_text()
+    with open(folder / "walk.csv", newline="") as file:
+        header, *rows = csv.reader(file)
+    assert header[1:] == [f"{name} (rad)" for name in robot.own_names]
+    set_point = np.array(rows, np.float32)[:, 1:]
+    assert set_point.shape == (51, robot.num_joints)
+    assert ((set_point >= np.float32(robot.joint_lower)) & (set_point <= np.float32(robot.joint_upper))).all()
+    # The left knee bends with positive angles, the right one with negative angles.
+    knees = set_point[:, [robot.joint_names.index(f"{side}_knee") for side in ("left", "right")]]
+    assert knees[:, 0].min() > 0.5 and knees[:, 1].max() < -0.5
+    # Without its file the robot is not known.
+    capsys.readouterr()
+    assert main(["export", "--policy", "humanoid.npz", "--to", "walk.c"]) == 2
+    assert "name its file with --robot" in capsys.readouterr().err
 
 
 def test_mistakes_are_one_clear_line(folder, capsys):

@@ -52,7 +52,8 @@ def plan(
         path: policy file; a steered walk walks straight ahead.
         speed: asked speed, m/s.
         duration: length of the walk, s.
-        robot: name of the robot that the policy must have; None accepts any.
+        robot: name of the robot that the policy must have, or the file that describes it; None is the robot
+            that the policy names.
         period: time between two set-points, s.
 
     Raises:
@@ -86,7 +87,8 @@ def time_of_fall(path: Path, speed: float, duration: float, *, robot: str | None
         path: policy file.
         speed: asked speed, m/s.
         duration: length of the walk, s.
-        robot: name of the robot that the policy must have; None accepts any.
+        robot: name of the robot that the policy must have, or the file that describes it; None is the robot
+            that the policy names.
     """
     walk = plan(path, speed, max(duration, 2 * CONTROL_PERIOD), robot=robot)
     setup = make_setup(walk.walker.robot, None, duration, WalkNoise(0.0, 0.0, 0.0), (), c.make_control_step)
