@@ -23,7 +23,8 @@ class Entry(NamedTuple):
 
 EXPERIMENTS = {
     "walk": Entry(
-        "a NAO learns to walk at a given speed (the main experiment)", ("quick", "paper", "author", "best")
+        "a robot learns to walk at a given speed (the main experiment)",
+        ("quick", "humanoid", "paper", "author", "best"),
     ),
     "walk_slope": Entry(
         "the same up and down slopes: the context is speed and slope; starts from the shipped walk",

@@ -12,6 +12,7 @@ from creps_jax.typing import Array, Float, Scalar
 __all__ = [
     "AUTHOR_BOUNDS",
     "GRAVITY",
+    "HUMANOID_BOUNDS",
     "NAO_BOUNDS",
     "NAO_H25_BOUNDS",
     "NAO_STEERED_BOUNDS",
@@ -89,6 +90,14 @@ NAO_H25_BOUNDS = (
 )
 """Bounds in which the real NAO, whose legs are shorter and weaker, can walk."""
 
+HUMANOID_BOUNDS = (
+    (0.0, 0.15, 0.02, 0.13, -5.0, 0.3, 0.0, 0.0, 0.0, 0.02),
+    (0.001, 0.195, 0.05, 0.28, 5.0, 1.0, 1.0, 0.15, 0.06, 0.2),
+)
+"""Bounds in which a humanoid with small feet or weak motors can walk, for a leg of the NAO's length. Of random
+gaits of a Booster T1 half stay up within them, and a tenth within `NAO_BOUNDS`: the oscillation of the height
+costs torque that the hips do not have."""
+
 STEERED_PARAM_NAMES = (*PARAM_NAMES, "step_side", "step_turn")
 """Names of the parameters of a steered walk: the ten, and a step's displacement to the left and turn."""
 
@@ -158,8 +167,8 @@ def scaled_bounds(robot: Robot, bounds: Bounds = NAO_BOUNDS) -> Bounds:
 
 
 def humanoid_bounds(robot: Robot) -> Bounds:
-    """Return the bounds in which a humanoid learns to walk: those of the NAO, scaled."""
-    return scaled_bounds(robot)
+    """Return the bounds in which a humanoid learns to walk, scaled to its leg."""
+    return scaled_bounds(robot, HUMANOID_BOUNDS)
 
 
 def scales(robot: Robot) -> tuple[float, ...]:

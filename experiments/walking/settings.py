@@ -223,6 +223,15 @@ SETTINGS = {
         archive_size=225,
         learning_duration=5.0,
     ),
+    "humanoid": dataclasses.replace(
+        _OURS,
+        iterations=200,
+        samples=60,
+        first_samples=60,
+        repeats=1,
+        archive_size=300,
+        learning_duration=5.0,
+    ),
     "paper": Settings(trials=5, bounds="paper"),
     "author": Settings(
         trials=5,
