@@ -36,7 +36,21 @@ _SOLE_FLATNESS, _SOLE_SHARE = 0.006, 0.5
 # Distance between the soles for a leg of the NAO's length, m.
 _SOLE_CLEARANCE = 0.02
 _MIRROR_TOLERANCE = 0.02
+# Numbers of joints of a leg.
+_LEG = {5: "5", 6: "6 joints, from hip to ankle"}
+# Joints that the inverse kinematics does not move.
+_OTHERS = "joints outside of the legs"
+# The geoms on which a robot can stand.
+_SIMPLE = (
+    mujoco.mjtGeom.mjGEOM_BOX,
+    mujoco.mjtGeom.mjGEOM_SPHERE,
+    mujoco.mjtGeom.mjGEOM_CAPSULE,
+    mujoco.mjtGeom.mjGEOM_CYLINDER,
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+)
 _KINEMATICS_TOLERANCE = 1e-4
+# Largest difference of an angle that is at its limit, rad.
+_ROUNDING = 1e-6
 # Weight, in the inverse kinematics, of the rotation that a leg of five joints cannot make.
 _MISSING_WEIGHT = 0.03
 
@@ -95,26 +109,33 @@ def humanoid_from_mjcf(
     Raises:
         ValueError: If the file cannot be read, a name is not in the model, the joints of a leg are not in the
             order of the model, the legs do not mirror each other, the knee bends backwards, a foot has no
-            geom or only meshes, the soles are not level with all leg angles zero, or a joint has no actuator
-            or no torque limit.
+            geom or only meshes, the soles are not level with all leg angles zero, a joint has no actuator or
+            no torque limit, or an argument has another type or is out of its range.
     """
-    path = Path(path)
     source = {key: value for key, value in locals().items() if value is not None and key != "path"}
+    checks.instance("path", path, str, Path)
+    if name is not None:
+        checks.instance("name", name, str)
+    path = Path(path)
+    legs = _names("left_leg", left_leg, _LEG), _names("right_leg", right_leg, _LEG)
+    feet = _names("feet", feet, {2: "2 bodies, the left and the right foot"})
+    _check_number("kp", kp, above=0.0)
+    _check_number("kv", kv, least=0.0)
+    _check_number("max_torque", max_torque, above=0.0)
+    _check_number("foot_spacing", foot_spacing, above=0.0)
+    speeds = None if speeds is None else _checked_speeds(speeds)
     spec = mjcf_model.read_spec(path)
     model = mjcf_model.compiled(spec, path)
-    if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-        raise ValueError(
-            f"the first joint of the model {path} must be the free joint of the trunk, got another"
-        )
     servos = mjcf_model.read_servos_of(model, max_torque)
     left, right = (
         _read_leg(model, spec, side, joints, foot)
-        for side, joints, foot in zip(
-            ("left", "right"), (left_leg, right_leg), _pair("feet", feet), strict=True
-        )
+        for side, joints, foot in zip(("left", "right"), legs, feet, strict=True)
     )
     names = tuple(servos)
-    held = _by_joint("held", held, names)
+    others = [joint for joint in names if joint not in left.joints + right.joints]
+    held = _held(held, others, servos)
+    swing = _by_joint("arm_swing", arm_swing, _OTHERS, others)
+    max_speeds = _max_speeds(max_speed, names)
     data = _posed(model, held)
     chains = [_chain(model, data, leg, servos) for leg in (left, right)]
     _check_mirrored(chains, (left, right))
@@ -124,9 +145,9 @@ def humanoid_from_mjcf(
     return _assembled(
         spec, model, path, source, chains, (left, right), servos, posture, data,
         name=name or path.stem,
-        arm_swing=_by_joint("arm_swing", arm_swing, names),
+        arm_swing=tuple(swing.get(joint, 0.0) for joint in names),
         gains=(kp, kv),
-        max_speed=max_speed,
+        max_speeds=max_speeds,
         foot_spacing=foot_spacing,
         speeds=speeds,
     )  # fmt: skip
@@ -136,11 +157,9 @@ def _read_leg(
     model: mujoco.MjModel, spec: mujoco.MjSpec, side: str, joints: Sequence[str], foot: str
 ) -> _Leg:
     """Check the names of a leg and their order in the tree of bodies."""
-    known = [model.joint(i).name for i in range(1, model.njnt)]
-    if isinstance(joints, str) or len(joints) not in (5, 6):
-        raise ValueError(f"{side}_leg must name five or six joints from hip to ankle, got {joints!r}")
-    ids = tuple(model.joint(named("joint", joint, known)).id for joint in joints)
-    named("body", foot, [model.body(i).name for i in range(1, model.nbody)])
+    known = [name for name in (model.joint(i).name for i in range(1, model.njnt)) if name]
+    ids = tuple(model.joint(named(f"{side}_leg", "joints", joint, known)).id for joint in joints)
+    named("feet", "bodies", foot, [model.body(i).name for i in range(1, model.nbody)])
     bodies = [int(model.jnt_bodyid[i]) for i in ids] + [model.body(foot).id]
     for (first, upper), (second, lower) in zip(
         zip(joints, bodies, strict=False), zip((*joints[1:], foot), bodies[1:], strict=True), strict=True
@@ -170,9 +189,10 @@ def _sole_geoms(model: mujoco.MjModel, spec: mujoco.MjSpec, side: str, foot: str
     geoms = [geom for body in bodies for geom in body.geoms]
     paired = {name for pair in spec.pairs for name in (pair.geomname1, pair.geomname2)}
     solid = [g for g in geoms if g.contype != 0 or g.conaffinity != 0 or g.name in paired]
-    simple = [geom for geom in solid if geom.type != mujoco.mjtGeom.mjGEOM_MESH]
+    simple = [geom for geom in solid if geom.type in _SIMPLE]
     if not simple:
-        found = "only meshes" if any(g.type == mujoco.mjtGeom.mjGEOM_MESH for g in solid or geoms) else "none"
+        is_mesh = any(geom.type == mujoco.mjtGeom.mjGEOM_MESH for geom in solid or geoms)
+        found = "only meshes" if is_mesh else "only geoms that touch nothing" if geoms else "none"
         raise ValueError(
             f"the {side} foot {foot!r} must have a geom that touches the floor, a box, sphere, capsule, "
             f"cylinder or ellipsoid, got {found}: add one to the body in the model"
@@ -201,9 +221,12 @@ def _chain(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg, servos: Mappin
     sole = np.eye(4)
     sole[:3, 3] = points[pitch[2], 0], points[-1, 1], low[2]
     weights = np.ones(6)
-    for rotation in range(3):
-        if np.abs(axes[:, rotation]).max() < _ALONG or (rotation == 0 and len(ids) == 5):
-            weights[3 + rotation] = _MISSING_WEIGHT
+    if len(ids) == 5:
+        # It cannot turn about z without a yaw joint, or about x with one roll joint, which places the foot.
+        num_roll, _, num_yaw = np.sum(np.abs(axes) > _ALONG, axis=0)
+        weights[3], weights[5] = (
+            1.0 if is_free else _MISSING_WEIGHT for is_free in (num_roll > 1, num_yaw > 0)
+        )
     limits = np.array([(servos[name].low, servos[name].high) for name in leg.joints])
     return LegChain(axes, points, sole, limits[:, 0], limits[:, 1], weights)
 
@@ -228,11 +251,13 @@ def _sole_box(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg) -> tuple[np
     """
     points = np.concatenate([_support_points(model, data, name) for name in leg.geoms])
     touching = points[points[:, 2] < points[:, 2].min() + _SOLE_FLATNESS]
-    spanned, length = np.ptp(touching[:, 0]), np.ptp(points[:, 0])
-    if spanned < _SOLE_SHARE * length:
+    spanned, size = np.ptp(touching, axis=0)[:2], np.ptp(points, axis=0)[:2]
+    # A row of points along x has no width; without a length no robot can stand.
+    if size[0] == 0.0 or (spanned < _SOLE_SHARE * size).any():
         raise ValueError(
             f"the sole of {leg.foot!r} must be level with all joints of the leg at zero, got lowest points "
-            f"that span {spanned:.3f} of its {length:.3f} m"
+            f"that span {spanned[0]:.3f} of its {size[0]:.3f} m forwards and {spanned[1]:.3f} of its "
+            f"{size[1]:.3f} m sideways"
         )
     return touching.min(axis=0), touching.max(axis=0)
 
@@ -317,7 +342,7 @@ def _posture(
     legs: Sequence[_Leg],
     names: Sequence[str],
     held: Mapping[str, float],
-    crouch: Sequence[float] | None,
+    crouch: Any,
 ) -> np.ndarray:
     """Return the angles of standing: soles level and below the hips, knees bent, found from the crouch."""
     posture = np.array([held.get(name, 0.0) for name in names])
@@ -328,18 +353,32 @@ def _posture(
             for joint, turn in ((hip, -0.5), (knee, 1.0), (ankle, -0.5)):
                 guess[joint] = turn * _FIRST_BEND * np.sign(chain.axes[joint, 1])
         else:
-            if len(crouch) != len(guess):
-                raise ValueError(
-                    f"crouch must have an angle for each of {', '.join(leg.joints)}, got {crouch}"
-                )
             # The right leg's angles have the sign of its axes relative to the mirrored ones.
             mirrored = chains[0].axes * np.array([-1.0, 1.0, -1.0])
             signs = 1.0 if chain is chains[0] else np.sign(np.sum(mirrored * chain.axes, axis=1))
-            guess = signs * checks.vector("crouch", crouch)
+            guess = signs * _checked_crouch(crouch, chains[0], legs[0])
         angles = _stand_on(chain, leg, guess)
         for name, angle in zip(leg.joints, angles, strict=True):
             posture[list(names).index(name)] = angle
     return posture
+
+
+def _checked_crouch(crouch: Any, chain: LegChain, leg: _Leg) -> np.ndarray:
+    """Return the angles of the left leg with bent knees after checking them."""
+    angles = checks.finite("crouch", checks.vector("crouch", crouch))
+    if angles.shape != (len(leg.joints),):
+        raise ValueError(
+            f"crouch must have an angle for each of {', '.join(leg.joints)}, got {checks.shown(crouch)}"
+        )
+    _, knee, _ = _pitch_joints(chain.axes, leg)
+    for i in (knee, *range(len(angles))):
+        if not chain.lower[i] - _ROUNDING <= angles[i] <= chain.upper[i] + _ROUNDING:
+            why = ", where the knee is bent forwards" if i == knee else ""
+            raise ValueError(
+                f"crouch must have {leg.joints[i]!r} from {chain.lower[i]:.2f} to {chain.upper[i]:.2f} rad"
+                f"{why}, got {angles[i]:g}"
+            )
+    return angles
 
 
 def _stand_on(chain: LegChain, leg: _Leg, guess: np.ndarray) -> np.ndarray:
@@ -411,11 +450,11 @@ def _assembled(
     data: mujoco.MjData,
     *,
     name: str,
-    arm_swing: Mapping[str, float],
+    arm_swing: tuple[float, ...],
     gains: tuple[float | None, float | None],
-    max_speed: float | Mapping[str, float] | None,
+    max_speeds: tuple[float, ...],
     foot_spacing: float | None,
-    speeds: Sequence[float] | None,
+    speeds: tuple[float, float] | None,
 ) -> Humanoid:
     """Derive lengths, centre of mass and gains, and put the record together."""
     names = tuple(servos)
@@ -429,19 +468,10 @@ def _assembled(
     com = standing.subtree_com[1]
     kp, kv = gains
     mass = float(model.body_subtreemass[1])
-    kp = _STIFFNESS * mass * GRAVITY * length if kp is None else checks.number("kp", kp, above=0.0)
-    kv = (
-        kp * _DAMPING_TIME * np.sqrt(length / NAO_LEG_LENGTH)
-        if kv is None
-        else checks.number("kv", kv, least=0.0)
-    )
+    kp = _STIFFNESS * mass * GRAVITY * length if kp is None else kp
+    root = np.sqrt(length / NAO_LEG_LENGTH)
+    kv = kp * _DAMPING_TIME * root if kv is None else kv
     servo_gains = {joint: (float(kp), float(kv)) for joint in names}
-    if isinstance(max_speed, Mapping):
-        fastest = _by_joint("max_speed", max_speed, names)
-        max_speeds = tuple(fastest.get(joint, _MAX_SPEED) for joint in names)
-    else:
-        fastest = _MAX_SPEED if max_speed is None else checks.number("max_speed", max_speed, above=0.0)
-        max_speeds = (float(fastest),) * len(names)
     lower, upper = (np.array([getattr(servos[joint], end) for joint in names]) for end in ("low", "high"))
     for chain, leg in zip(chains, legs, strict=True):
         where = [names.index(joint) for joint in leg.joints]
@@ -452,8 +482,7 @@ def _assembled(
         below_hips = left.sole[1, 3] - right.sole[1, 3]
         # A leg of five joints cannot hold its sole level while it leans inward.
         foot_spacing = min(beside, below_hips) if len(legs[0].joints) == 6 else below_hips
-    checks.number("foot_spacing", foot_spacing, above=0.0)
-    root = np.sqrt(length / NAO_LEG_LENGTH)
+    slow, fast = _NAO_SPEEDS
     return Humanoid(
         name=name,
         joint_names=names,
@@ -464,7 +493,7 @@ def _assembled(
         left_leg=tuple(names.index(joint) for joint in legs[0].joints),
         right_leg=tuple(names.index(joint) for joint in legs[1].joints),
         posture=tuple(posture.tolist()),
-        arm_swing=tuple(arm_swing.get(joint, 0.0) for joint in names),
+        arm_swing=arm_swing,
         hip_centre=(float(hip_x), float(hip_z)),
         leg_length=length,
         foot_spacing=float(foot_spacing),
@@ -479,24 +508,66 @@ def _assembled(
         right=right,
         model=mjcf_model.walking_model(spec, {leg.foot: leg.geoms for leg in legs}, servos, servo_gains),
         film_model=mjcf_model.film_model(spec, servos, servo_gains),
-        speeds=_pair("speeds", [root * v for v in _NAO_SPEEDS] if speeds is None else speeds),
+        speeds=(float(root * slow), float(root * fast)) if speeds is None else speeds,
         source=dict(source),
     )
 
 
-def _by_joint(argument: str, values: Mapping[str, float] | None, names: Sequence[str]) -> dict[str, float]:
-    """Return numbers by joint after checking the names."""
+def _by_joint(
+    argument: str, values: Any, kind: str, names: Sequence[str], *, above: float = -np.inf
+) -> dict[str, float]:
+    """Return numbers by joint after checking the names and the numbers."""
+    values = {} if values is None else values
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{argument} must be numbers by joint, got {checks.shown(values)}")
     return {
-        named("joint", joint, names): float(checks.number(f"{argument} of {joint}", value))
-        for joint, value in (values or {}).items()
+        named(argument, kind, joint, names): float(
+            checks.number(f"{argument} of {joint}", value, above=above)
+        )
+        for joint, value in values.items()
     }
 
 
-def _pair(argument: str, values: Sequence[Any]) -> tuple[Any, Any]:
-    if isinstance(values, str) or len(values) != 2:
-        raise ValueError(f"{argument} must be two values, got {values!r}")
-    first, second = values
-    return first, second
+def _held(values: Any, names: Sequence[str], servos: Mapping[str, Servo]) -> dict[str, float]:
+    """Return the angle at which each joint outside of the legs is held, rad: zero, if it can be."""
+    given = _by_joint("held", values, _OTHERS, names)
+    for joint, angle in given.items():
+        low, high = servos[joint].low, servos[joint].high
+        if not low - _ROUNDING <= angle <= high + _ROUNDING:
+            raise ValueError(f"held of {joint} must be from {low:.2f} to {high:.2f} rad, got {angle:g}")
+    return {joint: given.get(joint, min(max(0.0, servos[joint].low), servos[joint].high)) for joint in names}
+
+
+def _max_speeds(max_speed: Any, names: Sequence[str]) -> tuple[float, ...]:
+    """Return the largest speed of each joint, rad/s."""
+    if isinstance(max_speed, Mapping):
+        given = _by_joint("max_speed", max_speed, "joints", names, above=0.0)
+        return tuple(given.get(joint, _MAX_SPEED) for joint in names)
+    fastest = _MAX_SPEED if max_speed is None else checks.number("max_speed", max_speed, above=0.0)
+    return (float(fastest),) * len(names)
+
+
+def _check_number(argument: str, value: Any, **limits: float) -> None:
+    if value is not None:
+        checks.number(argument, value, **limits)
+
+
+def _checked_speeds(speeds: Any) -> tuple[float, float]:
+    values = checks.finite("speeds", checks.vector("speeds", speeds), above=0.0)
+    if values.shape != (2,) or not values[0] < values[1]:
+        raise ValueError(f"speeds must be two numbers, the lower first, got {checks.shown(speeds)}")
+    return float(values[0]), float(values[1])
+
+
+def _names(argument: str, values: Any, kinds: Mapping[int, str]) -> tuple[str, ...]:
+    """Return names after checking their number, one of `kinds`, and that each is there once."""
+    is_list = isinstance(values, Sequence) and not isinstance(values, str)
+    if not is_list or len(values) not in kinds or not all(isinstance(value, str) for value in values):
+        expected = " or ".join(kinds.values())
+        raise ValueError(f"{argument} must be the names of {expected}, got {checks.shown(values)}")
+    if len(set(values)) != len(values):
+        raise ValueError(f"{argument} must have each name once, got {checks.shown(values)}")
+    return tuple(values)
 
 
 def _is_below(model: mujoco.MjModel, lower: int, upper: int) -> bool:

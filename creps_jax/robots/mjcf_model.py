@@ -18,6 +18,10 @@ _FLOOR, _SOLID, _FOOT = 1, 2, 4
 _MESH, _PLANE, _HINGE = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtJoint.mjJNT_HINGE
 
 
+# Largest number of characters of MuJoCo's message in an error.
+_WIDTH = 160
+
+
 class Servo:
     """What a joint's motor can do, read from the model: torque, N m, and the range of angles, rad."""
 
@@ -26,40 +30,56 @@ class Servo:
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
-    """Read an MJCF file, and name the geoms that have no name.
+    """Read the robot of an MJCF file without the rest of its world, and name the geoms that have no name.
 
     Raises:
-        ValueError: If it cannot be read.
+        ValueError: If it cannot be read, or has not one robot with a free joint.
     """
     if not path.is_file():
-        raise ValueError(f"the model must be an MJCF file, got {path}, which does not exist")
+        raise ValueError(f"the model must be an MJCF file, got {path}, which is no file")
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ValueError(
-            f"the model {path} must be an MJCF file that MuJoCo can read: {_first_line(error)}"
+            f"the model {path} must be an MJCF file that MuJoCo can read: {_in_one_line(error)}"
         ) from error
+    _leave_only_the_robot(spec, path)
     for index, geom in enumerate(spec.geoms):
         geom.name = geom.name or f"creps_jax_geom_{index}"
     return spec
 
 
+def _leave_only_the_robot(spec: mujoco.MjSpec, path: Path) -> None:
+    """Delete the bodies without a free joint, poses, and sensors."""
+    bodies = spec.worldbody.bodies
+    is_free = [any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints) for body in bodies]
+    if sum(is_free) != 1:
+        found = [body.name for body, free in zip(bodies, is_free, strict=True) if free]
+        raise ValueError(
+            f"the model {path} must have one body with a free joint, the trunk of the robot, got "
+            f"{', '.join(found) or 'none'}"
+        )
+    others = [body for body, free in zip(bodies, is_free, strict=True) if not free]
+    _delete(spec, others, spec.keys, spec.sensors)
+
+
 def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     """Compile a model without the meshes, whose files may be missing.
 
-    Masses that the full model computes from meshes are kept if their files are there.
+    Masses that the full model computes from meshes are kept.
 
     Raises:
-        ValueError: If MuJoCo cannot compile it.
+        ValueError: If MuJoCo cannot compile it, or a mass follows from a mesh whose file is missing.
     """
     spec = spec.copy()
     _keep_masses(spec)
     _delete_meshes(spec)
-    _delete(spec, spec.keys, spec.sensors)
     try:
         return spec.compile()
     except ValueError as error:
-        raise ValueError(f"the model {path} must compile without its meshes: {_first_line(error)}") from error
+        raise ValueError(
+            f"the model {path} must compile without its meshes: {_in_one_line(error)}"
+        ) from error
 
 
 def walking_model(
@@ -118,10 +138,10 @@ def film_model(
 def _set_up(
     spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: Mapping[str, tuple[float, float]]
 ) -> None:
-    """Leave only the robot, give it servos, and set the solver."""
+    """Delete the geoms of the world, give the robot servos, and set the solver."""
     for geom in [geom for geom in spec.geoms if geom.parent.name == "world"]:
         spec.delete(geom)
-    _delete(spec, spec.keys, spec.sensors, spec.pairs, spec.actuators)
+    _delete(spec, spec.pairs, spec.actuators)
     for joint in spec.joints:
         if joint.name in servos:
             joint.actfrclimited = False
@@ -178,10 +198,20 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
 
 
 def _keep_masses(spec: mujoco.MjSpec) -> None:
-    """Write the masses and inertias that the full model has into its bodies, if it can be compiled."""
+    """Write the masses and inertias that the full model has into its bodies, if it can be compiled.
+
+    Raises:
+        ValueError: If it cannot, and a mass follows from a mesh.
+    """
     try:
         full = spec.copy().compile()
-    except ValueError:
+    except ValueError as error:
+        heavy = [geom.parent.name for geom in spec.geoms if geom.type == _MESH and _gives_mass(spec, geom)]
+        if heavy:
+            raise ValueError(
+                f"the mass of the body {heavy[0]!r} must be stated in the model, or follow from meshes whose "
+                f"files are there: {_in_one_line(error)}"
+            ) from error
         return
     for index, body in enumerate(spec.bodies):
         if index == 0:
@@ -194,6 +224,13 @@ def _keep_masses(spec: mujoco.MjSpec) -> None:
         )
         body.inertia = full.body_inertia[index]
         body.fullinertia = np.full(6, np.nan)
+
+
+def _gives_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
+    """Return whether the mass of a body depends on a geom."""
+    low, high = spec.compiler.inertiagrouprange
+    is_counted = not geom.parent.explicitinertial and low <= geom.group <= high
+    return is_counted and (geom.density if np.isnan(geom.mass) else geom.mass) > 0.0
 
 
 def _delete_meshes(spec: mujoco.MjSpec) -> None:
@@ -219,14 +256,21 @@ def _pair_frictions(spec: mujoco.MjSpec) -> dict[str, Sequence[float]]:
     return found
 
 
-def named(kind: str, name: str, known: Sequence[str]) -> str:
-    """Return a name of the model after checking that it is there.
+def named(argument: str, kind: str, name: str, known: Sequence[str]) -> str:
+    """Return a name after checking that it is known.
+
+    Args:
+        argument: The argument with the name, for errors.
+        kind: What the known names are.
+        name: The name.
+        known: The known names.
 
     Raises:
         ValueError: With the nearest name, if it is not.
     """
     if name not in known:
-        raise ValueError(f"the model has no {kind} {name!r}{suggest(name, known)}")
+        near = suggest(str(name), known)
+        raise ValueError(f"{argument} must name {kind} of the model, got {checks.shown(name)}{near}")
     return name
 
 
@@ -238,7 +282,7 @@ def read_servos_of(model: mujoco.MjModel, max_torque: float | None) -> dict[str,
         max_torque: Torque of the motors whose limit the model does not state, N m.
 
     Raises:
-        ValueError: If a joint has no actuator, or no torque limit is stated.
+        ValueError: If a joint is no hinge, or has no name, no actuator or no torque limit.
     """
     servos = {}
     for joint in range(model.njnt):
@@ -247,6 +291,9 @@ def read_servos_of(model: mujoco.MjModel, max_torque: float | None) -> dict[str,
         name = model.joint(joint).name
         if model.jnt_type[joint] != _HINGE:
             raise ValueError(f"all joints of the robot must be hinges, got {name!r}, which is none")
+        if not name:
+            body = model.body(model.jnt_bodyid[joint]).name
+            raise ValueError(f"each joint of the robot must have a name, got none for one of body {body!r}")
         is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
         actuators = np.flatnonzero(is_joint & (model.actuator_trnid[:, 0] == joint))
         if not len(actuators):
@@ -259,6 +306,10 @@ def read_servos_of(model: mujoco.MjModel, max_torque: float | None) -> dict[str,
                     "actuator no forcerange; name one in the model, or max_torque in the spec"
                 )
             torque = max_torque
+        if torque <= 0.0:
+            raise ValueError(
+                f"the torque of {name!r} must have a limit above 0 in both directions, got {torque:g}"
+            )
         servos[name] = Servo(torque, *_range_of(model, joint, actuators))
     return servos
 
@@ -289,5 +340,7 @@ def _range_of(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> tuple
     return low, high
 
 
-def _first_line(error: Exception) -> str:
-    return checks.shown(str(error).strip().splitlines()[0])
+def _in_one_line(error: Exception) -> str:
+    """Return the message of MuJoCo, which names the element in further lines."""
+    text = " ".join(str(error).removeprefix("Error: ").split())
+    return text if len(text) <= _WIDTH else f"{text[: _WIDTH - 4]} ..."

@@ -1,11 +1,13 @@
 """Read the description of a robot from a TOML file: the model, and the arguments of `humanoid_from_mjcf`."""
 
+import contextlib
 import importlib.util
 import inspect
 import tomllib
 from pathlib import Path
 from typing import Any
 
+from creps_jax import checks
 from creps_jax.errors import UserError, suggest
 from creps_jax.robots.humanoid import Humanoid
 
@@ -22,12 +24,13 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
         path: The TOML file.
 
     Raises:
-        UserError: If the file cannot be read, or has a key that is unknown or missing.
-        ValueError: If the robot cannot be made of it, see `humanoid_from_mjcf`.
+        UserError: If the file cannot be read, has a key that is unknown or missing, or the robot cannot be
+            made of it, see `humanoid_from_mjcf`.
     """
     # MuJoCo is imported only where a robot is read.
     from creps_jax.robots.mjcf import humanoid_from_mjcf
 
+    checks.instance("path", path, str, Path)
     path = Path(path)
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -45,7 +48,7 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
     values.setdefault("name", path.stem)
     try:
         return humanoid_from_mjcf(model, **values)
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
         raise UserError(f"{path}: {error}") from error
 
 
@@ -56,8 +59,11 @@ def _model_path(spec: Path, model: Any) -> Path:
     package, colon, inside = model.partition(":")
     if not colon:
         return spec.parent / model
-    found = importlib.util.find_spec(package) if package.isidentifier() else None
-    folders = None if found is None else found.submodule_search_locations
+    folders = None
+    # Python raises for a module without a file, such as `__main__`.
+    with contextlib.suppress(ValueError):
+        found = importlib.util.find_spec(package) if package.isidentifier() else None
+        folders = None if found is None else found.submodule_search_locations
     if not folders:
         raise UserError(
             f"model in {spec} must be in an installed package, got {model!r}: there is no package {package!r}"
