@@ -464,7 +464,7 @@ def _assembled(
     hip_x, _, hip_z = left.points[hip]
     ankle_height = left.points[ankle, 2] - left.sole[2, 3]
     low, high = _sole_box(model, data, legs[0])
-    standing = _posed(model, dict(zip(names, posture, strict=True)))
+    standing = _posed(model, dict(zip(names, posture.tolist(), strict=True)))
     com = standing.subtree_com[1]
     kp, kv = gains
     mass = float(model.body_subtreemass[1])
