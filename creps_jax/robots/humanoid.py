@@ -40,6 +40,8 @@ class LegChain(NamedTuple):
 class Humanoid(Robot):
     """A humanoid that was read from its MuJoCo model, see `humanoid_from_mjcf`.
 
+    It is equal only to itself: two of them may differ in their models alone.
+
     Attributes:
         left: Axes of the left leg.
         right: Axes of the right leg.
@@ -55,3 +57,6 @@ class Humanoid(Robot):
     film_model: "mujoco.MjModel"
     speeds: tuple[float, float]
     source: dict[str, Any]
+
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__

@@ -19,6 +19,7 @@ from creps_jax.typing import Float
 
 __all__ = ["humanoid_from_mjcf"]
 
+Number = float | int
 GRAVITY = 9.81
 # Gains of the servos: stiffness relative to weight times leg, and the damping time for a NAO's leg, s.
 # At a quarter of this stiffness robots of 20 to 33 kg fall in all gaits.
@@ -71,15 +72,15 @@ def humanoid_from_mjcf(
     right_leg: Sequence[str],
     feet: Sequence[str],
     name: str | None = None,
-    crouch: Sequence[float] | None = None,
-    held: Mapping[str, float] | None = None,
-    arm_swing: Mapping[str, float] | None = None,
-    kp: float | None = None,
-    kv: float | None = None,
-    max_speed: float | Mapping[str, float] | None = None,
-    max_torque: float | None = None,
-    foot_spacing: float | None = None,
-    speeds: Sequence[float] | None = None,
+    crouch: Sequence[Number] | None = None,
+    held: Mapping[str, Number] | None = None,
+    arm_swing: Mapping[str, Number] | None = None,
+    kp: Number | None = None,
+    kv: Number | None = None,
+    max_speed: Number | Mapping[str, Number] | None = None,
+    max_torque: Number | None = None,
+    foot_spacing: Number | None = None,
+    speeds: Sequence[Number] | None = None,
 ) -> Humanoid:
     """Read a humanoid from its MuJoCo model, so that it can walk.
 
@@ -451,9 +452,9 @@ def _assembled(
     *,
     name: str,
     arm_swing: tuple[float, ...],
-    gains: tuple[float | None, float | None],
+    gains: tuple[Number | None, Number | None],
     max_speeds: tuple[float, ...],
-    foot_spacing: float | None,
+    foot_spacing: Number | None,
     speeds: tuple[float, float] | None,
 ) -> Humanoid:
     """Derive lengths, centre of mass and gains, and put the record together."""

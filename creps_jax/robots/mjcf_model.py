@@ -274,7 +274,7 @@ def named(argument: str, kind: str, name: str, known: Sequence[str]) -> str:
     return name
 
 
-def read_servos_of(model: mujoco.MjModel, max_torque: float | None) -> dict[str, Servo]:
+def read_servos_of(model: mujoco.MjModel, max_torque: float | int | None) -> dict[str, Servo]:
     """Read the motor of each hinge joint: the smallest torque limit of joint and actuators, and the range.
 
     Args:
@@ -305,7 +305,7 @@ def read_servos_of(model: mujoco.MjModel, max_torque: float | None) -> dict[str,
                     f"the torque of {name!r} must have a limit: its joint has no actuatorfrcrange, and its "
                     "actuator no forcerange; name one in the model, or max_torque in the spec"
                 )
-            torque = max_torque
+            torque = float(max_torque)
         if torque <= 0.0:
             raise ValueError(
                 f"the torque of {name!r} must have a limit above 0 in both directions, got {torque:g}"

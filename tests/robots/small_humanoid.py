@@ -33,7 +33,7 @@ FEET = {
         f'<geom type="capsule" fromto="-0.05 {y} -0.03 0.11 {y} -0.03" size="0.01" mass="0.1"/>'
         for y in (-0.03, 0.04)
     ),
-    "cylinder": '<geom type="cylinder" pos="0.03 {y} -0.03" size="0.09 0.01" mass="0.2"/>',
+    "cylinder": '<geom type="cylinder" pos="0.03 {y} -0.03" size="0.06 0.01" mass="0.2"/>',
     "ellipsoid": "".join(
         f'<geom type="ellipsoid" pos="{x} 0 -0.03" size="0.02 0.03 0.01" mass="0.1"/>' for x in (-0.05, 0.11)
     ),
