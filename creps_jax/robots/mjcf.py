@@ -263,6 +263,15 @@ def _sole_box(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg) -> tuple[np
     return touching.min(axis=0), touching.max(axis=0)
 
 
+def _lowest_y(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg) -> float:
+    """Return how far to the right a foot reaches, in the frame of the trunk, m."""
+    geoms = [model.geom(name).id for name in leg.geoms]
+    rotations = data.geom_xmat[geoms].reshape(-1, 3, 3)
+    centres, halves = model.geom_aabb[geoms, :3], model.geom_aabb[geoms, 3:]
+    middles = data.geom_xpos[geoms] + np.einsum("nij,nj->ni", rotations, centres)
+    return float(np.min(middles[:, 1] - np.sum(np.abs(rotations[:, 1]) * halves, axis=1)))
+
+
 def _support_points(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> Float[np.ndarray, "n 3"]:
     """Return points of a geom between which it can touch a floor below, in the frame of the trunk, m."""
     geom = model.geom(name).id
@@ -478,7 +487,7 @@ def _assembled(
         where = [names.index(joint) for joint in leg.joints]
         lower[where], upper[where] = chain.lower, chain.upper
     if foot_spacing is None:
-        inner = left.sole[1, 3] - low[1]
+        inner = left.sole[1, 3] - _lowest_y(model, data, legs[0])
         beside = 2.0 * inner + _SOLE_CLEARANCE * length / NAO_LEG_LENGTH
         below_hips = left.sole[1, 3] - right.sole[1, 3]
         # A leg of five joints cannot hold its sole level while it leans inward.

@@ -52,7 +52,8 @@ def test_lengths_are_those_of_the_model(robot):
     assert [JOINTS[i] for i in robot.right_leg] == SPEC["right_leg"]
     assert robot.leg_length == pytest.approx(LENGTH)
     assert robot.hip_centre == pytest.approx((0.03, -0.09))
-    assert robot.foot_spacing == pytest.approx(0.14)
+    # The soles reach 0.04 m inwards from the ankles; their distance scales with the leg.
+    assert robot.foot_spacing == pytest.approx(0.08 + 0.02 * robot.size)
     assert robot.ankle_height == pytest.approx(0.06)
     assert robot.torso_height == pytest.approx(LENGTH + 0.06 + 0.09)
     assert robot.zmp_ahead_of_ankle == pytest.approx(0.03)
@@ -82,8 +83,9 @@ def test_soles_of_all_shapes_have_the_same_height(foot, tmp_path):
     robot = read(tmp_path, foot=foot)
     assert robot.ankle_height == pytest.approx(0.06, abs=1e-6)
     assert robot.zmp_ahead_of_ankle == pytest.approx(0.03, abs=1e-6)
-    assert robot.foot_spacing == pytest.approx(0.14)
-    # A box that stands on the floor at this height is there.
+    inner = {"box": 0.04, "sphere": 0.04, "capsule": 0.04, "cylinder": 0.055, "ellipsoid": 0.03}[foot]
+    assert robot.foot_spacing == pytest.approx(min(0.14, 2 * inner + 0.02 * robot.size))
+    # Both feet stand on the floor at this height.
     data = standing(robot)
     data.qpos[2] = -data.body("left_foot").xpos[2] + 0.04 - 1e-4
     mujoco.mj_forward(robot.model, data)
@@ -178,10 +180,12 @@ def test_what_is_given_is_taken(path):
         kp=80.0,
         kv=2.0,
         max_speed={"head": 3.0},
+        foot_spacing=0.13,
         speeds=[0.2, 0.4],
     )
     assert robot.name == "tiny" and robot.speeds == (0.2, 0.4)
     assert [robot.posture[joint(robot, name)] for name in ARMS] == [0.3, 0.0, -0.2]
+    assert robot.foot_spacing == 0.13
     assert robot.arm_swing == (-5.0,) + (0.0,) * 14
     assert robot.max_joint_speed == (8.0, 3.0) + (8.0,) * 13
     servos = read_servos(robot.model)

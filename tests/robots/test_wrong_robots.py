@@ -296,6 +296,8 @@ ARGUMENTS = {
     ),
     "max_torque 0": ({"max_torque": 0.0}, "max_torque must be finite and above 0, got 0.0$"),
     "max_torque a": ({"max_torque": "a"}, "max_torque must be a number, got 'a'$"),
+    "foot_spacing 0": ({"foot_spacing": 0.0}, "foot_spacing must be finite and above 0, got 0.0$"),
+    "foot_spacing a": ({"foot_spacing": "a"}, "foot_spacing must be a number, got 'a'$"),
     "speeds out of order": (
         {"speeds": (0.5, 0.1)},
         r"speeds must be two numbers, the lower first, got \(0.5, 0.1\)$",
