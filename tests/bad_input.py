@@ -30,7 +30,7 @@ from creps_jax import tasks
 from creps_jax.files import policies_folder
 from creps_jax.numerics import rotations
 from creps_jax.policies.features import polynomial_features
-from creps_jax.robots import nao_geometry
+from creps_jax.robots import mjcf, nao_geometry, screw_kinematics, spec
 from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.search.archive import push
 from creps_jax.search.dual import DualSolution
@@ -54,6 +54,7 @@ from creps_jax.walking import (
     zmp,
 )
 from creps_jax.walking.posture import Balance
+from tests.robots import small_humanoid
 
 # What of an argument an error names, where it is a part of it.
 NAMES = {
@@ -119,6 +120,11 @@ def count(good: int, least: int = 1) -> Argument:
             one_of((np.float32(2.5), "2.5"), (jnp.ones(3), "(3,)")),
         ),
     )
+
+
+def not_none(spoilt: st.SearchStrategy[Spoilt]) -> st.SearchStrategy[Spoilt]:
+    """Leave out None, which stands for a default."""
+    return spoilt.filter(lambda bad: bad.value is not None)
 
 
 def key(good: jax.Array) -> Argument:
@@ -351,6 +357,17 @@ FOLDER = Path(tempfile.mkdtemp())
 LEARNED.save(FOLDER / "policy.npz")
 NO_PATH = one_of((None, "None"), (5, "5"), (["a"], "['a']"))
 MODEL = load_nao()
+SMALL = mjcf.humanoid_from_mjcf(small_humanoid.write_model(FOLDER), **small_humanoid.SPEC)
+SMALL_SPEC = FOLDER / "small.toml"
+SMALL_SPEC.write_text(
+    'model = "small.xml"\n' + "".join(f"{name} = {value}\n" for name, value in small_humanoid.SPEC.items())
+)
+CHAIN = record(SMALL.left)
+NAMES_OF = {
+    name: Argument(value, NONSENSE | one_of((3, "3"), (value[:1], value[0]), ([2, *value[1:]], "[2")))
+    for name, value in small_humanoid.SPEC.items()
+}
+BY_JOINT = one_of((3, "3"), ("three", "'three'"), ({"head": "a"}, "'a'"), ({"a": 1}, "'a'"), ([0.1], "[0.1]"))
 WALK = params.params_from_theta(jnp.asarray(np.mean(params.NAO_BOUNDS, axis=0), jnp.float32))
 PLAN = WALKER.start().plan
 POSE = engine.BodyPose(jnp.zeros(4), jnp.zeros(4), jnp.zeros(4), jnp.zeros(()))
@@ -401,6 +418,7 @@ INNER = {
     "changed_fields",
     "initial_state",
     "leg_reach",
+    "solve_legs",
     "read_servos",
     "substep_shares",
     "world_of",
@@ -671,6 +689,33 @@ ROWS = {
     ),
     "leg_fk": row(cj.leg_fk, joint_pos=array(np.zeros(6)), **WALK_POSES),
     "leg_ik": row(cj.leg_ik, T_torso_sole=array(np.eye(4)), **WALK_POSES),
+    "chain_fk": traced(screw_kinematics.chain_fk, joint_pos=array(np.zeros(6)), chain=CHAIN),
+    "chain_ik": traced(
+        screw_kinematics.chain_ik,
+        T_torso_sole=array(np.eye(4)),
+        guess=array(np.zeros(6)),
+        chain=CHAIN,
+        iterations=count(3),
+    ),
+    "humanoid_from_mjcf": made(
+        mjcf.humanoid_from_mjcf,
+        path=Argument(FOLDER / "small.xml", NO_PATH),
+        **NAMES_OF,
+        name=Argument("small", one_of((3, "3"), (["a"], "['a']"))),
+        crouch=Argument(None, one_of((3, "3"), (["a"] * 6, "'a'"), ([math.nan] * 6, "nan"))),
+        held=Argument(None, BY_JOINT),
+        arm_swing=Argument(None, BY_JOINT),
+        kp=Argument(50.0, not_none(no_number(above=0.0))),
+        kv=Argument(1.0, not_none(no_number(least=0.0))),
+        max_speed=Argument(8.0, one_of((-1.0, "-1.0"), ("three", "'three'"), ({"head": 0}, "0"))),
+        max_torque=Argument(8.0, not_none(no_number(above=0.0))),
+        foot_spacing=Argument(0.12, not_none(no_number(above=0.0))),
+        speeds=Argument((0.1, 0.3), one_of((3, "3"), ((0.3, 0.1), "(0.3, 0.1)"), (("a", "b"), "'a'"))),
+    ),
+    "humanoid_from_toml": made(spec.humanoid_from_toml, path=Argument(SMALL_SPEC, NO_PATH)),
+    "humanoid_bounds": row(params.humanoid_bounds, robot=record(SMALL)),
+    "scaled_bounds": row(params.scaled_bounds, robot=record(NAO)),
+    "load_model": made(models.load_model, robot=record(SMALL)),
     "check_model": made(models.check_model, model=record(MODEL), robot=record(NAO)),
     "leg_ik of a shared motor": row(
         partial(cj.leg_ik, np.eye(4, dtype=np.float32), 1.0, robot=NAO_H25), yaw_pitch=optional(number(0.1))

@@ -480,18 +480,20 @@ def _assembled(
     mass = float(model.body_subtreemass[1])
     kp = _STIFFNESS * mass * GRAVITY * length if kp is None else kp
     root = np.sqrt(length / NAO_LEG_LENGTH)
-    kv = kp * _DAMPING_TIME * root if kv is None else kv
+    # A number below 0 that float32 cannot hold is 0.
+    kv = kp * _DAMPING_TIME * root if kv is None else max(kv, 0.0)
     servo_gains = {joint: (float(kp), float(kv)) for joint in names}
     lower, upper = (np.array([getattr(servos[joint], end) for joint in names]) for end in ("low", "high"))
     for chain, leg in zip(chains, legs, strict=True):
         where = [names.index(joint) for joint in leg.joints]
         lower[where], upper[where] = chain.lower, chain.upper
-    if foot_spacing is None:
+    spacing = foot_spacing
+    if spacing is None:
         inner = left.sole[1, 3] - _lowest_y(model, data, legs[0])
         beside = 2.0 * inner + _SOLE_CLEARANCE * length / NAO_LEG_LENGTH
         below_hips = left.sole[1, 3] - right.sole[1, 3]
         # A leg of five joints cannot hold its sole level while it leans inward.
-        foot_spacing = min(beside, below_hips) if len(legs[0].joints) == 6 else below_hips
+        spacing = min(beside, below_hips) if len(legs[0].joints) == 6 else below_hips
     slow, fast = _NAO_SPEEDS
     return Humanoid(
         name=name,
@@ -506,7 +508,7 @@ def _assembled(
         arm_swing=arm_swing,
         hip_centre=(float(hip_x), float(hip_z)),
         leg_length=length,
-        foot_spacing=float(foot_spacing),
+        foot_spacing=float(spacing),
         ankle_height=float(ankle_height),
         torso_height=float(length + ankle_height - hip_z),
         com_above_hip=float(com[2] - hip_z),

@@ -18,6 +18,8 @@ LARGEST_STEP = 0.5
 # Damping for each unit of squared pose error, and at the solution. It bounds the steps out of reach and at a
 # straight leg; near a solution it vanishes, and the convergence is quadratic.
 DAMPING, LEAST_DAMPING = 0.1, 1e-7
+# Largest squared error that adds to the damping: with poses that float32 can hold no step is NaN.
+LARGEST_ERROR = 1e9
 
 
 @checks.arguments
@@ -59,12 +61,12 @@ def chain_ik(
         iterations: Number of Newton steps.
 
     Raises:
-        ValueError: If the pose is not a finite matrix (4, 4), or there is not one angle for each axis.
+        ValueError: If the pose is not a finite matrix (4, 4), or there is not one finite angle for each axis.
 
     Source: Sugihara 2011, Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method.
     """
     checks.finite("T_torso_sole", T_torso_sole)
-    checks.array("guess", guess, (len(chain.axes),))
+    checks.finite("guess", checks.array("guess", guess, (len(chain.axes),)))
     dtype = T_torso_sole.dtype
     lower, upper = jnp.asarray(chain.lower, dtype), jnp.asarray(chain.upper, dtype)
 
@@ -88,7 +90,7 @@ def _newton_equations(joint_pos: Array, T_torso_sole: Array, chain: LegChain) ->
     to_sole = jnp.zeros((6, 6), error.dtype).at[:3, :3].set(R_torso_sole.T).at[3:, 3:].set(R_torso_sole.T)
     weighted = jnp.asarray(chain.weights, error.dtype)[:, None] * to_sole
     error, jacobian = weighted @ error, weighted @ jacobian
-    damping = DAMPING * jnp.sum(error**2) + LEAST_DAMPING
+    damping = DAMPING * jnp.minimum(jnp.sum(error**2), LARGEST_ERROR) + LEAST_DAMPING
     matrix = jacobian.T @ jacobian + damping * jnp.eye(len(joint_pos), dtype=error.dtype)
     return matrix, jacobian.T @ error
 

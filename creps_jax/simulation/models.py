@@ -35,8 +35,14 @@ def load_nao(robot: Robot = NAO) -> mujoco.MjModel:
     return spec.compile()
 
 
+@checks.arguments
 def load_model(robot: Robot) -> mujoco.MjModel:
-    """Return the model in which a robot is simulated: that of a NAO's file, or that of a `Humanoid`."""
+    """Return the model in which a robot is simulated: that of a NAO's file, or that of a `Humanoid`.
+
+    Raises:
+        ValueError: If it is no robot.
+        FileNotFoundError: If the file of a NAO does not exist.
+    """
     return robot.model if isinstance(robot, Humanoid) else load_nao(robot)
 
 

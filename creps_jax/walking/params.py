@@ -152,6 +152,7 @@ class WalkParams(NamedTuple):
     step_growth: Scalar
 
 
+@checks.arguments
 def scaled_bounds(robot: Robot, bounds: Bounds = NAO_BOUNDS) -> Bounds:
     """Return bounds of the ten parameters of a NAO, scaled to another robot.
 
@@ -166,6 +167,7 @@ def scaled_bounds(robot: Robot, bounds: Bounds = NAO_BOUNDS) -> Bounds:
     )
 
 
+@checks.arguments
 def humanoid_bounds(robot: Robot) -> Bounds:
     """Return the bounds in which a humanoid learns to walk, scaled to its leg."""
     return scaled_bounds(robot, HUMANOID_BOUNDS)

@@ -138,6 +138,7 @@ def test_out_of_reach_and_at_the_hip_angles_and_gradients_are_finite(robot, comp
     places = 10.0 ** rng.uniform(-1.0, 4.0, (50, 1)) * rng.uniform(-1.0, 1.0, (50, 3))
     places[:10] = chain.points[2]
     places[10] = 0.0
+    places[11] = 1e30
     poses = jax.vmap(rigid_transform)(rotations, jnp.asarray(places, jnp.float32))
     guesses = np.tile(posture_of(robot, "left"), (50, 1))
     guesses[::5] = 0.0
