@@ -51,8 +51,7 @@ def chain_ik(
     it would take beyond a limit stop there, and the others make up for them. Within the limits and the reach
     it converges quadratically: from angles within 0.05 rad, three iterations leave an error below 1e-5 m and
     rad. Out of reach the angles are finite and the sole is near the pose. All angles are within the limits.
-    A leg of fewer than six joints approximates the pose by
-    `chain.weights`.
+    A leg of fewer than six joints approximates the pose by `chain.weights`.
 
     Args:
         T_torso_sole: Desired pose of the sole in the torso frame, m.

@@ -197,6 +197,7 @@ def _chain_constants(robot: Humanoid) -> list[str]:
         "LARGEST_JOINT_STEP": screw_kinematics.LARGEST_STEP,
         "DAMPING": screw_kinematics.DAMPING,
         "LEAST_DAMPING": screw_kinematics.LEAST_DAMPING,
+        "LARGEST_ERROR": screw_kinematics.LARGEST_ERROR,
     }
     counts = {
         "IS_NAO": False,

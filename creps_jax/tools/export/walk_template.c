@@ -361,13 +361,44 @@ static void solve_positive(float a[NUM_LEG_JOINTS][NUM_LEG_JOINTS], float x[NUM_
     }
 }
 
+/* Solve for a step in place; entries beyond their limits are set to them, and the others solved again. */
+static void solve_within(
+    float a[NUM_LEG_JOINTS][NUM_LEG_JOINTS],
+    const float lowest[NUM_LEG_JOINTS],
+    const float highest[NUM_LEG_JOINTS],
+    float x[NUM_LEG_JOINTS])
+{
+    float factor[NUM_LEG_JOINTS][NUM_LEG_JOINTS], rest[NUM_LEG_JOINTS], at_limit[NUM_LEG_JOINTS];
+    int is_free[NUM_LEG_JOINTS], i, j;
+    for (i = 0; i < NUM_LEG_JOINTS; ++i) {
+        rest[i] = x[i];
+        for (j = 0; j < NUM_LEG_JOINTS; ++j) {
+            factor[i][j] = a[i][j];
+        }
+    }
+    solve_positive(factor, x);
+    for (i = 0; i < NUM_LEG_JOINTS; ++i) {
+        is_free[i] = x[i] >= lowest[i] && x[i] <= highest[i];
+        at_limit[i] = is_free[i] ? 0.0f : clip(x[i], lowest[i], highest[i]);
+    }
+    for (i = 0; i < NUM_LEG_JOINTS; ++i) {
+        for (j = 0; j < NUM_LEG_JOINTS; ++j) {
+            rest[i] -= a[i][j] * at_limit[j];
+            factor[i][j] = is_free[i] && is_free[j] ? a[i][j] : (i == j ? 1.0f : 0.0f);
+        }
+        x[i] = is_free[i] ? rest[i] : at_limit[i];
+    }
+    solve_positive(factor, x);
+}
+
 /* Compute the damped Newton step for the error of the pose, lengths relative to that of the leg. */
 static void newton_step(
     const leg_chain *leg, const sole_pose *wanted, const float angles[NUM_LEG_JOINTS], float step[NUM_LEG_JOINTS])
 {
     const float length = fabsf(leg->sole[2][3] - leg->points[0][2]);
     float axes[NUM_LEG_JOINTS][3], points[NUM_LEG_JOINTS][3], columns[NUM_LEG_JOINTS][6];
-    float normal[NUM_LEG_JOINTS][NUM_LEG_JOINTS], along[3], about[3], error[6], damping;
+    float normal[NUM_LEG_JOINTS][NUM_LEG_JOINTS], lowest[NUM_LEG_JOINTS], highest[NUM_LEG_JOINTS];
+    float along[3], about[3], error[6], damping;
     sole_pose sole;
     matrix to_sole, turn;
     int i, j;
@@ -392,14 +423,16 @@ static void newton_step(
         along[2] = axis[0] * about[1] - axis[1] * about[0];
         weigh(leg, &to_sole, along, axis, columns[j]);
     }
-    damping = DAMPING * dot6(error, error) + LEAST_DAMPING;
+    damping = DAMPING * fminf(dot6(error, error), LARGEST_ERROR) + LEAST_DAMPING;
     for (i = 0; i < NUM_LEG_JOINTS; ++i) {
         for (j = 0; j < NUM_LEG_JOINTS; ++j) {
             normal[i][j] = dot6(columns[i], columns[j]) + (i == j ? damping : 0.0f);
         }
         step[i] = dot6(columns[i], error);
+        lowest[i] = leg->low[i] - angles[i];
+        highest[i] = leg->high[i] - angles[i];
     }
-    solve_positive(normal, step);
+    solve_within(normal, lowest, highest, step);
 }
 
 /* Write the joint angles of both legs, left and right, for the poses of their soles: Newton steps from the
