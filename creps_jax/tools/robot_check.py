@@ -99,8 +99,9 @@ def try_standard_gaits(ranges: RobotRanges, *, seed: int = 0) -> list[Trial]:
     task = nao_walk(low, high, duration=_SECONDS, **settings)
     factors = dict(zip(PARAM_NAMES, scales(robot), strict=True))
     contexts, thetas = [], []
-    for duration, height, speed in itertools.product(_DURATIONS, _HEIGHTS, (low, 0.5 * (low + high), high)):
-        values = _PARAMETERS | {"step_duration": duration, "hip_height": height}
+    speeds = (low, 0.5 * (low + high), high)
+    for step_duration, hip_height, speed in itertools.product(_DURATIONS, _HEIGHTS, speeds):
+        values = _PARAMETERS | {"step_duration": step_duration, "hip_height": hip_height}
         theta = {name: factors[name] * values.get(name, 0.0) for name in PARAM_NAMES}
         theta["step_length"] = speed * theta["step_duration"]
         contexts.append([speed])
@@ -109,9 +110,9 @@ def try_standard_gaits(ranges: RobotRanges, *, seed: int = 0) -> list[Trial]:
     walk = jax.jit(jax.vmap(task.rollout))
     outcome = jax.tree.map(np.asarray, walk(keys, jnp.asarray(contexts), jnp.asarray(thetas)))
     ways = zip(contexts, thetas, outcome.speed[:, 0], outcome.fell, outcome.seconds, strict=True)
-    where = [PARAM_NAMES.index(name) for name in ("step_duration", "hip_height")]
+    duration, height = (PARAM_NAMES.index(name) for name in ("step_duration", "hip_height"))
     return [
-        Trial(*(theta[i] for i in where), asked, float(reached), float(seconds) if fell else None)
+        Trial(theta[duration], theta[height], asked, float(reached), float(seconds) if fell else None)
         for (asked,), theta, reached, fell, seconds in ways
     ]
 

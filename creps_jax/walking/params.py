@@ -94,9 +94,11 @@ HUMANOID_BOUNDS = (
     (0.0, 0.15, 0.02, 0.13, -5.0, 0.3, 0.0, 0.0, 0.0, 0.02),
     (0.001, 0.195, 0.05, 0.28, 5.0, 1.0, 1.0, 0.15, 0.06, 0.2),
 )
-"""Bounds in which a humanoid with small feet or weak motors can walk, for a leg of the NAO's length. Of random
-gaits of a Booster T1 half stay up within them, and a tenth within `NAO_BOUNDS`: the oscillation of the height
-costs torque that the hips do not have."""
+"""Bounds in which a humanoid with small feet or weak motors can walk, for a leg of the NAO's length.
+
+Of random gaits of a Booster T1 half stay up within them, and a tenth within `NAO_BOUNDS`: the oscillation of
+the height costs torque that the hips do not have.
+"""
 
 STEERED_PARAM_NAMES = (*PARAM_NAMES, "step_side", "step_turn")
 """Names of the parameters of a steered walk: the ten, and a step's displacement to the left and turn."""

@@ -74,7 +74,7 @@ def main(
 
 
 def speeds_of(saved: Learned, num: int = NUM_SPEEDS) -> np.ndarray:
-    """Return equally spaced speeds over the range of a policy, m/s; by default, for the NAO, the paper's 11."""
+    """Return equally spaced speeds over the range of a policy, m/s; by default 11, as in the paper."""
     return np.linspace(saved.contexts.low[0], saved.contexts.high[0], num, dtype=np.float32)
 
 
