@@ -12,7 +12,9 @@ from .policies.features import (
 from .policies.gaussian import LinearGaussian, fit_weighted_ml, linear_gaussian, start_policy
 from .policies.learned import Learned, load, save
 from .policies.space import Space, sigmoid_gate
+from .robots.mjcf import humanoid_from_mjcf
 from .robots.nao_kinematics import leg_fk, leg_ik
+from .robots.spec import humanoid_from_toml
 from .search.archive import Archive, Batch
 from .search.base import Search
 from .search.creps import Creps, CrepsInfo, CrepsState, creps
@@ -63,6 +65,8 @@ __all__ = [
     "fit_weighted_ml",
     "gaussian_contexts",
     "hole_reaching",
+    "humanoid_from_mjcf",
+    "humanoid_from_toml",
     "learned",
     "learned_walker",
     "leg_fk",

@@ -24,6 +24,7 @@ Reproduce the figures and tables of the paper, and learn to walk.
   python -m experiments list                      list the experiments and their presets
   python -m experiments run walk --preset quick   learn to walk, a few minutes
   python -m experiments run walk --robot nao_h25  learn to walk with the model of the real NAO H25
+  python -m experiments run walk --robot k1.toml  learn to walk with a humanoid that a file describes
   python -m experiments run walk --resume         resume the latest unfinished run
   python -m experiments run walk --help           show all settings of an experiment
   python -m experiments run all                   run the paper's Figures 5 to 9, half an hour
@@ -57,7 +58,8 @@ class Run:
 
     Attributes:
         name: The experiment, or "all" for the paper's Figures 5 to 9.
-        preset: Settings preset; the first preset of the experiment by default.
+        preset: Settings preset; by default the first one of the experiment, or `humanoid` for a robot that a
+            file describes.
         config: The manifest.json of an earlier run: start from its settings and seed instead of a preset.
         seed: Seed of all random numbers; 0 by default.
         out: Result folder; a new one in results/ by default.
@@ -174,19 +176,24 @@ def _run_one(name: str, arguments: list[str]) -> int:
     import_mjx_quietly()
     from rich.console import Console
 
+    from creps_jax.tools.robots import is_spec, robot_id
     from experiments import runner
     from experiments.request import Request, default_settings, folder_to_resume
 
     experiment = registry.load(name)
-    folder = folder_to_resume(name, early.out, early.robot) if early.resume else early.out
+    robot = early.robot and robot_id(early.robot)
+    folder = folder_to_resume(name, early.out, robot) if early.resume else early.out
+    preset = early.preset
+    if name == "walk" and is_spec(robot or "") and not (preset or early.config or early.resume):
+        preset = "humanoid"
     default = default_settings(
-        experiment, name, preset=early.preset, config=early.config, out=folder, resume=early.resume
+        experiment, name, preset=preset, config=early.config, out=folder, resume=early.resume
     )
     options, settings = _options_and_settings(experiment, name, arguments, default)
     check_seed(options.seed)
     request = Request(
         name=name,
-        preset=options.preset,
+        preset=preset,
         config=options.config,
         seed=options.seed,
         settings=settings,

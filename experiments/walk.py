@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from creps_jax import files
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned
-from creps_jax.tools import plots, tables
+from creps_jax.tools import plots, robot_check, tables
 from creps_jax.tools.play import POLICY, filmed_speeds, record, save_film
+from creps_jax.tools.robots import is_spec
 from creps_jax.walking.params import PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
 from experiments.learning import Log, Session
 from experiments.records import Arrays, Learning, Walks, named
@@ -30,6 +31,8 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         the mean reward at the same speeds in the noise of learning, by which a trial is chosen.
     """
     evaluate_key, learn_key = jax.random.split(key)
+    if is_spec(settings.robot) and session.console is not None:
+        session.console.print(robot_check.summary(robot_check.try_standard_gaits(settings.ranges())))
     states, log = learning.learn_to_walk(settings, learn_key, session=session, name="walk")
     policy = states.policy
     trial_reward = _trial_reward(settings, jax.random.fold_in(key, 1), policy)

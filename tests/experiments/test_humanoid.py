@@ -1,0 +1,119 @@
+"""A robot that a file describes, from the first command to the last: check, learn, play, drive, export."""
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+from creps_jax.errors import UserError
+from creps_jax.policies.learned import load
+from creps_jax.tools import play, robot_check
+from creps_jax.tools.cli import main as tools
+from creps_jax.tools.robot_check import Trial, summary
+from creps_jax.tools.robots import find_robot, robot_id
+from creps_jax.walking.params import HUMANOID_BOUNDS, humanoid_bounds
+from experiments.cli import main
+from experiments.walk import SETTINGS
+from tests.tools.offset_humanoid import write_spec
+
+TINY = "--iterations 3 --samples 8 --first-samples 8 --learning-duration 2.5 --duration 2.5 --eval-seeds 1"
+
+
+@pytest.fixture(scope="module")
+def spec(tmp_path_factory):
+    return write_spec(tmp_path_factory.mktemp("robot"))
+
+
+@pytest.fixture(scope="module")
+def learned(spec, tmp_path_factory):
+    """The folder of a run that learns for one iteration."""
+    folder = tmp_path_factory.mktemp("run") / "walk"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder.parent)
+        patch.setattr(play, "write_video", lambda path, model, clips, **_: path.write_bytes(b"film"))
+        assert main(["run", "walk", "--robot", str(spec), "--out", str(folder), *TINY.split()]) == 0
+    return folder
+
+
+def test_a_robot_is_described_and_tried_before_it_learns(spec, capsys):
+    assert tools(["robot", str(spec)]) == 0
+    out = capsys.readouterr().out
+    robot = find_robot(str(spec)).robot
+    assert out.startswith(f"{robot.name}: ") and "of 18 standard gaits stay up" in out.splitlines()[-1]
+    assert robot.joint_names[robot.left_leg[0]] in out
+
+
+def test_no_gait_that_stays_up_is_an_advice():
+    fallen = [Trial(0.2, 0.2, 0.1, 0.0, 1.5)] * 3
+    assert summary(fallen).startswith(
+        "0 of 3 standard gaits stay up, the longest for 1.5 s: learning may fail"
+    )
+    assert summary([*fallen, Trial(0.2, 0.2, 0.1, 0.1, None)]) == "1 of 4 standard gaits stay up"
+
+
+def test_a_run_of_a_robot_from_a_file_is_one_of_the_preset_humanoid(learned, spec):
+    policy = load(learned / "policy.npz")
+    robot = find_robot(str(spec)).robot
+    assert policy.task["robot"] == robot.name and policy.task["spec"] == robot_id(str(spec))
+    assert policy.task["com"] == "continuous" and policy.task["balance"]["filter_time"] == 0.06
+    np.testing.assert_allclose(policy.parameters.low, humanoid_bounds(robot)[0], rtol=1e-6)
+    assert policy.contexts.low == (robot.speeds[0],) and policy.contexts.high == (robot.speeds[1],)
+    assert {path.name for path in learned.iterdir()} >= {"table.md", "speed.png", "walk.mp4"}
+
+
+def test_bounds_of_a_humanoid_scale_with_its_leg(spec):
+    robot = find_robot(str(spec)).robot
+    lengths, times = np.array(humanoid_bounds(robot))[:, [1, 7]], np.array(humanoid_bounds(robot))[:, 3]
+    np.testing.assert_allclose(lengths, robot.size * np.array(HUMANOID_BOUNDS)[:, [1, 7]])
+    np.testing.assert_allclose(times, robot.size**0.5 * np.array(HUMANOID_BOUNDS)[:, 3])
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_its_policy_is_played_driven_and_exported(learned, spec, tmp_path, monkeypatch, named):
+    models = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(play, "write_video", lambda path, model, clips, **_: models.append(model.suffix))
+    option = ["--robot", str(spec)] if named else []
+    policy = ["--policy", str(learned / "policy.npz"), *option]
+    (tmp_path / "commands.csv").write_text("time,vx,vy,turn\n0,0.1,0,0\n0.5,0,0,0\n")
+    assert tools(["play", *policy, "--speed", "0.1"]) == 0
+    assert tools(["drive", *policy, "--script", "commands.csv"]) == 0
+    for to in ("walk.c", "policy.h"):
+        assert tools(["export", *policy, "--to", to]) == 0
+    assert models == [".mjb", ".mjb"] and (tmp_path / "walk.h").exists()
+
+
+def test_a_policy_whose_description_has_moved_asks_for_it(learned, spec, tmp_path):
+    saved = load(learned / "policy.npz")
+    moved = dataclasses.replace(saved, task={**saved.task, "spec": str(tmp_path / "gone.toml")})
+    with pytest.raises(UserError, match=r"described by .*gone.toml, which is not there: name its file with"):
+        play.robot_of(moved)
+    assert play.robot_of(moved, str(spec)).name == saved.task["robot"]
+    with pytest.raises(UserError, match=r"the policy is of the robot .*, not of nao"):
+        play.robot_of(moved, "nao")
+
+
+def test_a_description_must_not_take_the_name_of_a_nao(spec, tmp_path):
+    for path in spec.parent.iterdir():
+        shutil.copy(path, tmp_path)
+    text = "".join(f"{line}\n" for line in spec.read_text().splitlines() if not line.startswith("name"))
+    (tmp_path / "nao.toml").write_text(text)
+    with pytest.raises(UserError, match="must give its robot a name of its own, got 'nao'"):
+        find_robot(str(tmp_path / "nao.toml"))
+
+
+def test_the_settings_of_a_nao_are_those_of_the_paper_and_of_a_humanoid_others(spec):
+    nao, other = SETTINGS["quick"], dataclasses.replace(SETTINGS["quick"], robot=str(spec))
+    for name, expected in {"com": "one_step", "filter_time": 0.0, "upright": 0.0}.items():
+        assert nao.of_robot(name) == expected
+        assert other.of_robot(name) != expected
+    assert dataclasses.replace(other, com="one_step").of_robot("com") == "one_step"
+    assert other.resolved().robot == robot_id(str(spec)) and other.resolved().com == "continuous"
+
+
+def test_standard_gaits_are_eighteen_at_three_speeds(spec):
+    ranges = find_robot(str(spec))
+    trials = robot_check.try_standard_gaits(ranges)
+    assert len(trials) == 18
+    assert {trial.asked for trial in trials} == {ranges.low, 0.5 * (ranges.low + ranges.high), ranges.high}
