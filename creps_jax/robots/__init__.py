@@ -1,1 +1,1 @@
-"""The robots: lengths, limits and leg kinematics."""
+"""The robots: lengths, limits and leg kinematics, also read from MuJoCo models."""
