@@ -225,7 +225,7 @@ SETTINGS = {
     ),
     "humanoid": dataclasses.replace(
         _OURS,
-        iterations=200,
+        iterations=120,
         samples=60,
         first_samples=60,
         repeats=1,
