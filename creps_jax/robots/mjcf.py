@@ -65,6 +65,25 @@ class _Leg(NamedTuple):
     ids: tuple[int, ...]
 
 
+class _Sole(NamedTuple):
+    """A sole in a pose of the leg in which it is level; all lengths in the frame of the trunk.
+
+    Attributes:
+        place: Origin of the sole frame, straight below the ankle in the lower face, m; its axes are parallel
+            to those of the trunk.
+        ankle_height: Height of the ankle above the sole, m.
+        middle: Middle of the sole, as far as it touches the floor, ahead of the ankle, m.
+        right_edge: The largest distance of a point of the foot to the right of the origin, m.
+        T_foot_sole: Pose of the sole frame in that of the foot body, m.
+    """
+
+    place: Float[np.ndarray, "3"]
+    ankle_height: float
+    middle: float
+    right_edge: float
+    T_foot_sole: Float[np.ndarray, "4 4"]
+
+
 def humanoid_from_mjcf(
     path: Path | str,
     *,
@@ -94,7 +113,8 @@ def humanoid_from_mjcf(
         right_leg: Those of the right leg, which must mirror the left one.
         feet: Names of the left and the right foot body.
         name: Name of the robot; by default that of the file.
-        crouch: Angles of the left leg with bent knees, rad; by default knees bent forwards.
+        crouch: Angles of the left leg with bent knees, rad; by default knees bent forwards. Soles that are
+            not level with all leg angles zero must be level with these, the feet pointing along x.
         held: Angles at which other joints are held, by name, rad; zero by default.
         arm_swing: Change of a joint's angle for each metre that the left foot is ahead of the right one, by
             name, rad/m; none by default.
@@ -110,8 +130,8 @@ def humanoid_from_mjcf(
     Raises:
         ValueError: If the file cannot be read, a name is not in the model, the joints of a leg are not in the
             order of the model, the legs do not mirror each other, the knee bends backwards, a foot has no
-            geom or only meshes, the soles are not level with all leg angles zero, a joint has no actuator or
-            no torque limit, or an argument has another type or is out of its range.
+            geom or only meshes, the soles are level neither with all leg angles zero nor in the crouch, a
+            joint has no actuator or no torque limit, or an argument has another type or is out of its range.
     """
     source = {key: value for key, value in locals().items() if value is not None and key != "path"}
     checks.instance("path", path, str, Path)
@@ -137,14 +157,21 @@ def humanoid_from_mjcf(
     held = _held(held, others, servos)
     swing = _by_joint("arm_swing", arm_swing, _OTHERS, others)
     max_speeds = _max_speeds(max_speed, names)
-    data = _posed(model, held)
-    chains = [_chain(model, data, leg, servos) for leg in (left, right)]
+    zero = _posed(model, held)
+    chains = [_chain(zero, leg, servos) for leg in (left, right)]
     _check_mirrored(chains, (left, right))
     chains = [_with_knee_ahead(chain, leg) for chain, leg in zip(chains, (left, right), strict=True)]
-    posture = _posture(chains, (left, right), names, held, crouch)
-    _check_kinematics(model, chains, (left, right), held)
+    crouches = None if crouch is None else _crouches(crouch, chains, (left, right))
+    level = _level_pose(model, (left, right), held, crouches)
+    soles = [_read_sole(model, level, chain, leg) for chain, leg in zip(chains, (left, right), strict=True)]
+    chains = [
+        chain._replace(sole=_foot_pose(model, zero, leg) @ sole.T_foot_sole)
+        for chain, leg, sole in zip(chains, (left, right), soles, strict=True)
+    ]
+    posture = _posture(chains, (left, right), soles, names, held, crouches)
+    _check_kinematics(model, chains, (left, right), soles, held)
     return _assembled(
-        spec, model, path, source, chains, (left, right), servos, posture, data,
+        spec, model, path, source, chains, (left, right), soles, servos, posture,
         name=name or path.stem,
         arm_swing=tuple(swing.get(joint, 0.0) for joint in names),
         gains=(kp, kv),
@@ -213,14 +240,17 @@ def _posed(model: mujoco.MjModel, held: Mapping[str, float], angles: Mapping[str
     return data
 
 
-def _chain(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg, servos: Mapping[str, Servo]) -> LegChain:
-    """Read the axes of a leg, its sole and the limits of its joints, with all its angles zero."""
+def _chain(zero: mujoco.MjData, leg: _Leg, servos: Mapping[str, Servo]) -> LegChain:
+    """Read the axes of a leg, with all its angles zero, and the limits of its joints.
+
+    The sole is unknown: it is set when it is known in which pose the soles are level.
+
+    Raises:
+        ValueError: If not three of the axes are along y.
+    """
     ids = list(leg.ids)
-    axes, points = data.xaxis[ids].copy(), data.xanchor[ids].copy()
-    pitch = _pitch_joints(axes, leg)
-    low, _ = _sole_box(model, data, leg)
-    sole = np.eye(4)
-    sole[:3, 3] = points[pitch[2], 0], points[-1, 1], low[2]
+    axes, points = zero.xaxis[ids].copy(), zero.xanchor[ids].copy()
+    _pitch_joints(axes, leg)
     weights = np.ones(6)
     if len(ids) == 5:
         # It cannot turn about z without a yaw joint, or about x with one roll joint, which places the foot.
@@ -229,7 +259,7 @@ def _chain(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg, servos: Mappin
             1.0 if is_free else _MISSING_WEIGHT for is_free in (num_roll > 1, num_yaw > 0)
         )
     limits = np.array([(servos[name].low, servos[name].high) for name in leg.joints])
-    return LegChain(axes, points, sole, limits[:, 0], limits[:, 1], weights)
+    return LegChain(axes, points, np.eye(4), limits[:, 0], limits[:, 1], weights)
 
 
 def _pitch_joints(axes: Float[np.ndarray, "k 3"], leg: _Leg) -> tuple[int, int, int]:
@@ -244,23 +274,68 @@ def _pitch_joints(axes: Float[np.ndarray, "k 3"], leg: _Leg) -> tuple[int, int, 
     return tuple(int(i) for i in pitch)  # type: ignore[return-value]
 
 
-def _sole_box(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lowest and the highest corner of a box around the sole, in the frame of the trunk, m.
+def _level_pose(
+    model: mujoco.MjModel,
+    legs: Sequence[_Leg],
+    held: Mapping[str, float],
+    crouches: Sequence[np.ndarray] | None,
+) -> mujoco.MjData:
+    """Return the kinematics with all leg angles zero, or else in the crouch: the pose with level soles.
 
     Raises:
-        ValueError: If the sole is not level.
+        ValueError: If a sole is level in neither.
     """
+    where, data = "zero", _posed(model, held)
+    if crouches is not None and _tilted(model, data, legs):
+        where = "the crouch"
+        angles = [dict(zip(leg.joints, each, strict=True)) for leg, each in zip(legs, crouches, strict=True)]
+        data = _posed(model, held, angles[0] | angles[1])
+    tilted = _tilted(model, data, legs)
+    if tilted is not None:
+        _, spanned, size = _touching(model, data, tilted)
+        raise ValueError(
+            f"the sole of {tilted.foot!r} must be level with all joints of the leg at zero, or else at the "
+            f"angles of crouch, got lowest points at {where} that span {spanned[0]:.3f} of its {size[0]:.3f} "
+            f"m forwards and {spanned[1]:.3f} of its {size[1]:.3f} m sideways"
+        )
+    return data
+
+
+def _tilted(model: mujoco.MjModel, data: mujoco.MjData, legs: Sequence[_Leg]) -> _Leg | None:
+    """Return the first leg whose sole is not level."""
+    for leg in legs:
+        _, spanned, size = _touching(model, data, leg)
+        # A row of points along x has no width; without a length no robot can stand.
+        if size[0] == 0.0 or (spanned < _SOLE_SHARE * size).any():
+            return leg
+    return None
+
+
+def _touching(
+    model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """Return the points of a sole that touch a level floor, their length and width, and those of all, m."""
     points = np.concatenate([_support_points(model, data, name) for name in leg.geoms])
     touching = points[points[:, 2] < points[:, 2].min() + _SOLE_FLATNESS]
-    spanned, size = np.ptp(touching, axis=0)[:2], np.ptp(points, axis=0)[:2]
-    # A row of points along x has no width; without a length no robot can stand.
-    if size[0] == 0.0 or (spanned < _SOLE_SHARE * size).any():
-        raise ValueError(
-            f"the sole of {leg.foot!r} must be level with all joints of the leg at zero, got lowest points "
-            f"that span {spanned[0]:.3f} of its {size[0]:.3f} m forwards and {spanned[1]:.3f} of its "
-            f"{size[1]:.3f} m sideways"
-        )
-    return touching.min(axis=0), touching.max(axis=0)
+    return touching, np.ptp(touching, axis=0)[:2], np.ptp(points, axis=0)[:2]
+
+
+def _read_sole(model: mujoco.MjModel, level: mujoco.MjData, chain: LegChain, leg: _Leg) -> _Sole:
+    """Read the sole of a leg in a pose in which it is level."""
+    points = level.xanchor[list(leg.ids)]
+    _, _, ankle = _pitch_joints(chain.axes, leg)
+    touching, _, _ = _touching(model, level, leg)
+    low, high = touching.min(axis=0), touching.max(axis=0)
+    place = np.array([points[ankle, 0], points[-1, 1], low[2]])
+    T_trunk_sole = np.eye(4)
+    T_trunk_sole[:3, 3] = place
+    return _Sole(
+        place=place,
+        ankle_height=float(points[ankle, 2] - low[2]),
+        middle=float(0.5 * (low[0] + high[0]) - place[0]),
+        right_edge=float(place[1] - _lowest_y(model, level, leg)),
+        T_foot_sole=np.linalg.inv(_foot_pose(model, level, leg)) @ T_trunk_sole,
+    )
 
 
 def _lowest_y(model: mujoco.MjModel, data: mujoco.MjData, leg: _Leg) -> float:
@@ -350,27 +425,35 @@ def _with_knee_ahead(chain: LegChain, leg: _Leg) -> LegChain:
 def _posture(
     chains: Sequence[LegChain],
     legs: Sequence[_Leg],
+    soles: Sequence[_Sole],
     names: Sequence[str],
     held: Mapping[str, float],
-    crouch: Any,
+    crouches: Sequence[np.ndarray] | None,
 ) -> np.ndarray:
     """Return the angles of standing: soles level and below the hips, knees bent, found from the crouch."""
     posture = np.array([held.get(name, 0.0) for name in names])
-    for chain, leg in zip(chains, legs, strict=True):
-        hip, knee, ankle = _pitch_joints(chain.axes, leg)
-        guess = np.zeros(len(leg.joints))
-        if crouch is None:
-            for joint, turn in ((hip, -0.5), (knee, 1.0), (ankle, -0.5)):
-                guess[joint] = turn * _FIRST_BEND * np.sign(chain.axes[joint, 1])
-        else:
-            # The right leg's angles have the sign of its axes relative to the mirrored ones.
-            mirrored = chains[0].axes * np.array([-1.0, 1.0, -1.0])
-            signs = 1.0 if chain is chains[0] else np.sign(np.sum(mirrored * chain.axes, axis=1))
-            guess = signs * _checked_crouch(crouch, chains[0], legs[0])
-        angles = _stand_on(chain, leg, guess)
+    guesses = [_bent(chain, leg) for chain, leg in zip(chains, legs, strict=True)]
+    for chain, leg, sole, guess in zip(chains, legs, soles, crouches or guesses, strict=True):
+        angles = _stand_on(chain, leg, sole, guess)
         for name, angle in zip(leg.joints, angles, strict=True):
             posture[list(names).index(name)] = angle
     return posture
+
+
+def _bent(chain: LegChain, leg: _Leg) -> np.ndarray:
+    """Return the angles of a leg with its knee bent forwards."""
+    angles = np.zeros(len(leg.joints))
+    for joint, turn in zip(_pitch_joints(chain.axes, leg), (-0.5, 1.0, -0.5), strict=True):
+        angles[joint] = turn * _FIRST_BEND * np.sign(chain.axes[joint, 1])
+    return angles
+
+
+def _crouches(crouch: Any, chains: Sequence[LegChain], legs: Sequence[_Leg]) -> list[np.ndarray]:
+    """Return the angles of both legs with bent knees, of those of the left one, after checking them."""
+    left = _checked_crouch(crouch, chains[0], legs[0])
+    # The right leg's angles have the sign of its axes relative to the mirrored ones.
+    mirrored = chains[0].axes * np.array([-1.0, 1.0, -1.0])
+    return [left, np.sign(np.sum(mirrored * chains[1].axes, axis=1)) * left]
 
 
 def _checked_crouch(crouch: Any, chain: LegChain, leg: _Leg) -> np.ndarray:
@@ -391,13 +474,11 @@ def _checked_crouch(crouch: Any, chain: LegChain, leg: _Leg) -> np.ndarray:
     return angles
 
 
-def _stand_on(chain: LegChain, leg: _Leg, guess: np.ndarray) -> np.ndarray:
+def _stand_on(chain: LegChain, leg: _Leg, sole: _Sole, guess: np.ndarray) -> np.ndarray:
     """Return the angles with which the sole is level, and the ankle below the hip."""
-    hip, _, ankle = _pitch_joints(chain.axes, leg)
-    pose = chain.sole.copy()
-    pose[0, 3] = chain.points[hip, 0]
-    pose[2, 3] += (1.0 - _STANDING_HEIGHT) * _leg_length(chain, leg)
-    pose[2, 3] += chain.points[hip, 2] - chain.points[ankle, 2] - _leg_length(chain, leg)
+    x, _, z = chain.points[_pitch_joints(chain.axes, leg)[0]]
+    pose = np.eye(4)
+    pose[:3, 3] = x, sole.place[1], z - _STANDING_HEIGHT * _leg_length(chain, leg) - sole.ankle_height
     solve = jax.jit(lambda pose, guess: chain_ik(pose, guess, chain, iterations=100))
     angles = solve(jnp.asarray(pose, jnp.float32), jnp.asarray(guess, jnp.float32))
     found = np.asarray(chain_fk(angles, chain))
@@ -418,14 +499,16 @@ def _leg_length(chain: LegChain, leg: _Leg) -> float:
 
 
 def _check_kinematics(
-    model: mujoco.MjModel, chains: Sequence[LegChain], legs: Sequence[_Leg], held: Mapping[str, float]
+    model: mujoco.MjModel,
+    chains: Sequence[LegChain],
+    legs: Sequence[_Leg],
+    soles: Sequence[_Sole],
+    held: Mapping[str, float],
 ) -> None:
     """Compare our forward kinematics with MuJoCo's at random angles."""
     rng = np.random.default_rng(0)
-    for chain, leg in zip(chains, legs, strict=True):
+    for chain, leg, sole in zip(chains, legs, soles, strict=True):
         fk = jax.jit(lambda angles, chain=chain: chain_fk(angles, chain))
-        home = _foot_pose(model, _posed(model, held), leg)
-        T_foot_sole = np.linalg.inv(home) @ chain.sole
         for _ in range(20):
             angles = rng.uniform(np.maximum(chain.lower, -1.5), np.minimum(chain.upper, 1.5)).astype(
                 np.float32
@@ -433,7 +516,7 @@ def _check_kinematics(
             theirs = _foot_pose(
                 model, _posed(model, held, dict(zip(leg.joints, angles.tolist(), strict=True))), leg
             )
-            error = np.abs(np.asarray(fk(jnp.asarray(angles))) - theirs @ T_foot_sole).max()
+            error = np.abs(np.asarray(fk(jnp.asarray(angles))) - theirs @ sole.T_foot_sole).max()
             if not error < _KINEMATICS_TOLERANCE:
                 raise ValueError(
                     f"the pose of {leg.foot!r} must follow from the joints {', '.join(leg.joints)}, got "
@@ -455,9 +538,9 @@ def _assembled(
     source: Mapping[str, Any],
     chains: Sequence[LegChain],
     legs: Sequence[_Leg],
+    soles: Sequence[_Sole],
     servos: Mapping[str, Servo],
     posture: np.ndarray,
-    data: mujoco.MjData,
     *,
     name: str,
     arm_swing: tuple[float, ...],
@@ -469,11 +552,9 @@ def _assembled(
     """Derive lengths, centre of mass and gains, and put the record together."""
     names = tuple(servos)
     left, right = chains
-    hip, _, ankle = _pitch_joints(left.axes, legs[0])
     length = _leg_length(left, legs[0])
-    hip_x, _, hip_z = left.points[hip]
-    ankle_height = left.points[ankle, 2] - left.sole[2, 3]
-    low, high = _sole_box(model, data, legs[0])
+    hip_x, _, hip_z = left.points[_pitch_joints(left.axes, legs[0])[0]]
+    ankle_height = soles[0].ankle_height
     standing = _posed(model, dict(zip(names, posture.tolist(), strict=True)))
     com = standing.subtree_com[1]
     kp, kv = gains
@@ -489,9 +570,8 @@ def _assembled(
         lower[where], upper[where] = chain.lower, chain.upper
     spacing = foot_spacing
     if spacing is None:
-        inner = left.sole[1, 3] - _lowest_y(model, data, legs[0])
-        beside = 2.0 * inner + _SOLE_CLEARANCE * length / NAO_LEG_LENGTH
-        below_hips = left.sole[1, 3] - right.sole[1, 3]
+        beside = 2.0 * soles[0].right_edge + _SOLE_CLEARANCE * length / NAO_LEG_LENGTH
+        below_hips = soles[0].place[1] - soles[1].place[1]
         # A leg of five joints cannot hold its sole level while it leans inward.
         spacing = min(beside, below_hips) if len(legs[0].joints) == 6 else below_hips
     slow, fast = _NAO_SPEEDS
@@ -509,11 +589,11 @@ def _assembled(
         hip_centre=(float(hip_x), float(hip_z)),
         leg_length=length,
         foot_spacing=float(spacing),
-        ankle_height=float(ankle_height),
+        ankle_height=ankle_height,
         torso_height=float(length + ankle_height - hip_z),
         com_above_hip=float(com[2] - hip_z),
         com_ahead_of_hip=float(com[0] - hip_x),
-        zmp_ahead_of_ankle=float(0.5 * (low[0] + high[0]) - left.sole[0, 3]),
+        zmp_ahead_of_ankle=soles[0].middle,
         own_names=names,
         own_signs=(1.0,) * len(names),
         left=left,

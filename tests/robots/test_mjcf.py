@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from creps_jax.robots.mjcf import humanoid_from_mjcf
+from creps_jax.robots.screw_kinematics import chain_fk
 from creps_jax.robots.spec import humanoid_from_toml
 from creps_jax.simulation.models import check_model, load_model
 from creps_jax.simulation.servos import read_servos
@@ -197,6 +198,63 @@ def test_what_is_given_is_taken(path):
 def test_a_crouch_leads_to_the_same_posture_with_the_signs_of_the_right_leg(path, robot):
     crouched = humanoid_from_mjcf(path, **SPEC, crouch=[0.0, 0.0, -0.9, 1.6, -0.7, 0.0])
     np.testing.assert_allclose(crouched.posture, robot.posture, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def offset(tmp_path_factory):
+    """Return the humanoid with ankles whose zero is turned by 0.5 rad: its soles are level in the crouch."""
+    link, ankle = '"{}_ankle_pitch_link" pos="-0.005 0 -0.2"', '"{}_ankle_pitch" axis="0 1 0" range="{} {}"'
+    changes = []
+    for side in ("left", "right"):
+        changes.append((link.format(side), f'{link.format(side)} euler="0 0.5 0"'))
+        changes.append((ankle.format(side, -1.3, 1.0), ankle.format(side, -1.8, 0.5)))
+    path = write_model(tmp_path_factory.mktemp("offset"), *changes)
+    return humanoid_from_mjcf(path, **SPEC, crouch=[0.0, 0.0, -0.6, 1.2, -1.1, 0.0])
+
+
+def test_soles_may_be_level_in_the_crouch_alone(robot, offset):
+    for name in (
+        "hip_centre",
+        "leg_length",
+        "foot_spacing",
+        "ankle_height",
+        "torso_height",
+        "com_above_hip",
+        "com_ahead_of_hip",
+        "zmp_ahead_of_ankle",
+        "speeds",
+    ):
+        assert getattr(offset, name) == pytest.approx(getattr(robot, name), abs=1e-5), name
+    turned = np.array([0.5 if "ankle_pitch" in name else 0.0 for name in JOINTS])
+    np.testing.assert_allclose(offset.posture + turned, robot.posture, atol=1e-4)
+    np.testing.assert_allclose(offset.joint_lower + turned, robot.joint_lower, atol=1e-6)
+
+
+def test_a_sole_that_is_level_in_the_crouch_has_the_same_poses(robot, offset):
+    turned = np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0], np.float32)
+    angles = np.array([0.3, 0.2, -0.7, 0.9, -0.4, 0.2], np.float32)
+    for ours, theirs in ((offset.left, robot.left), (offset.right, robot.right)):
+        np.testing.assert_allclose(chain_fk(angles - turned, ours), chain_fk(angles, theirs), atol=1e-6)
+        # At zero the toes are down.
+        assert ours.sole[2, 0] == pytest.approx(-np.sin(0.5))
+
+
+def test_a_crouch_may_turn_the_hips(tmp_path):
+    changes = [
+        (f'"{side}_hip_roll_link"', f'"{side}_hip_roll_link" euler="{turn} 0 0"')
+        for side, turn in (("left", 0.2), ("right", -0.2))
+    ]
+    robot = read(tmp_path, *changes, spec=SPEC | {"crouch": [0.0, -0.2, -0.6, 1.2, -0.6, 0.0]})
+    # At zero the ankles are farther out than in the crouch.
+    assert robot.left.points[-1, 1] > 0.15
+    assert robot.ankle_height == pytest.approx(0.06)
+    np.testing.assert_allclose(robot.foot_spacing, 0.08 + 0.02 * robot.size, rtol=1e-6)
+    data = standing(robot)
+    for side, sign, roll in (("left", 1.0, -0.2), ("right", -1.0, 0.2)):
+        foot = data.body(f"{side}_foot")
+        np.testing.assert_allclose(foot.xmat.reshape(3, 3), np.eye(3), atol=1e-4)
+        np.testing.assert_allclose(foot.xpos[:2], [0.03, 0.07 * sign], atol=1e-4)
+        assert robot.posture[joint(robot, f"{side}_hip_roll")] == pytest.approx(roll, abs=1e-3)
 
 
 def test_a_joint_that_cannot_be_zero_is_held_at_its_limit(tmp_path):

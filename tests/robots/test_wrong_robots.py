@@ -128,8 +128,9 @@ MODELS = {
     "feet of meshes": ({"foot": "mesh"}, "touches the floor, .* got only meshes: add one"),
     "tilted feet": (
         {"foot": "tilted"},
-        "the sole of 'left_foot' must be level with all joints of the leg at zero, got lowest points that "
-        r"span 0.000 of its 0.180 m forwards and 0.090 of its 0.090 m sideways$",
+        "the sole of 'left_foot' must be level with all joints of the leg at zero, or else at the angles of "
+        "crouch, got lowest points at zero that span 0.000 of its 0.180 m forwards and 0.090 of its 0.090 m "
+        "sideways$",
     ),
     "feet tilted sideways": (
         [('size="0.09 0.045 0.01" mass', 'size="0.09 0.045 0.01" euler="0.2 0 0" mass')],
@@ -343,6 +344,18 @@ def small(tmp_path_factory):
 def test_a_wrong_argument_is_named(wrong, small):
     arguments, message = ARGUMENTS[wrong]
     assert re.search(message, error_of(small, **arguments))
+
+
+def test_feet_that_are_tilted_in_the_crouch_too_are_named(tmp_path):
+    path = write_model(tmp_path, foot="tilted")
+    assert re.search(
+        "the sole of 'left_foot' must be level with all joints of the leg at zero, or else at the angles of "
+        "crouch, got lowest points at the crouch that span 0.000 of its 0.180 m forwards and 0.090 of its "
+        "0.090 m sideways$",
+        error_of(path, crouch=[0.0, 0.0, -0.4, 0.8, -0.4, 0.0]),
+    )
+    # A crouch that makes them level must have a knee that is bent forwards, as any.
+    assert re.search("crouch must have 'left_knee'", error_of(path, crouch=[0.0, 0.0, 0.4, -0.4, -0.2, 0.0]))
 
 
 def test_a_leg_of_four_joints_is_named(tmp_path):
