@@ -6,27 +6,18 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from creps_jax import checks
-from creps_jax.errors import suggest
+from creps_jax.robots.mjcf_servos import Servo
 
-__all__ = ["Servo", "compiled", "film_model", "read_spec", "walking_model"]
+# Only `humanoid_from_mjcf` is public.
+__all__: list[str] = []
 
 TIMESTEP = 0.004
 _ITERATIONS, _LINE_ITERATIONS = 10, 10
 # Contact bits: the floor touches every solid, and the feet also touch each other.
 _FLOOR, _SOLID, _FOOT = 1, 2, 4
-_MESH, _PLANE, _HINGE = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtJoint.mjJNT_HINGE
-
-
+_MESH, _PLANE = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_PLANE
 # Largest number of characters of MuJoCo's message in an error.
 _WIDTH = 160
-
-
-class Servo:
-    """What a joint's motor can do, read from the model: torque, N m, and the range of angles, rad."""
-
-    def __init__(self, torque: float, low: float, high: float) -> None:
-        self.torque, self.low, self.high = torque, low, high
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
@@ -254,90 +245,6 @@ def _pair_frictions(spec: mujoco.MjSpec) -> dict[str, Sequence[float]]:
             if other in ground:
                 found[name] = (pair.friction[0], pair.friction[2], pair.friction[3])
     return found
-
-
-def named(argument: str, kind: str, name: str, known: Sequence[str]) -> str:
-    """Return a name after checking that it is known.
-
-    Args:
-        argument: The argument with the name, for errors.
-        kind: What the known names are.
-        name: The name.
-        known: The known names.
-
-    Raises:
-        ValueError: With the nearest name, if it is not.
-    """
-    if name not in known:
-        near = suggest(str(name), known)
-        raise ValueError(f"{argument} must name {kind} of the model, got {checks.shown(name)}{near}")
-    return name
-
-
-def read_servos_of(model: mujoco.MjModel, max_torque: float | int | None) -> dict[str, Servo]:
-    """Read the motor of each hinge joint: the smallest torque limit of joint and actuators, and the range.
-
-    Args:
-        model: The compiled robot.
-        max_torque: Torque of the motors whose limit the model does not state, N m.
-
-    Raises:
-        ValueError: If a joint is no hinge, or has no name, no actuator or no torque limit.
-    """
-    servos = {}
-    for joint in range(model.njnt):
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            continue
-        name = model.joint(joint).name
-        if model.jnt_type[joint] != _HINGE:
-            raise ValueError(f"all joints of the robot must be hinges, got {name!r}, which is none")
-        if not name:
-            body = model.body(model.jnt_bodyid[joint]).name
-            raise ValueError(f"each joint of the robot must have a name, got none for one of body {body!r}")
-        is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
-        actuators = np.flatnonzero(is_joint & (model.actuator_trnid[:, 0] == joint))
-        if not len(actuators):
-            raise ValueError(f"each joint must have an actuator in the model, got none for {name!r}")
-        torque = _torque_limit(model, joint, actuators)
-        if not np.isfinite(torque):
-            if max_torque is None:
-                raise ValueError(
-                    f"the torque of {name!r} must have a limit: its joint has no actuatorfrcrange, and its "
-                    "actuator no forcerange; name one in the model, or max_torque in the spec"
-                )
-            torque = float(max_torque)
-        if torque <= 0.0:
-            raise ValueError(
-                f"the torque of {name!r} must have a limit above 0 in both directions, got {torque:g}"
-            )
-        servos[name] = Servo(torque, *_range_of(model, joint, actuators))
-    return servos
-
-
-def _torque_limit(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> float:
-    limits = [np.abs(model.jnt_actfrcrange[joint]).min()] if model.jnt_actfrclimited[joint] else []
-    for each in actuators:
-        gear = abs(model.actuator_gear[each, 0])
-        if model.actuator_forcelimited[each]:
-            limits.append(gear * np.abs(model.actuator_forcerange[each]).min())
-        is_motor = model.actuator_biastype[each] == mujoco.mjtBias.mjBIAS_NONE
-        if is_motor and model.actuator_ctrllimited[each]:
-            gain = abs(model.actuator_gainprm[each, 0])
-            limits.append(gear * gain * np.abs(model.actuator_ctrlrange[each]).min())
-    return float(min(limits, default=np.inf))
-
-
-def _range_of(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> tuple[float, float]:
-    """Return the range of a joint, or that of the set-points of its position servo, or a whole turn."""
-    ranges = [model.jnt_range[joint]] if model.jnt_limited[joint] else []
-    for each in actuators:
-        is_servo = model.actuator_biastype[each] == mujoco.mjtBias.mjBIAS_AFFINE
-        is_servo &= model.actuator_biasprm[each, 1] == -model.actuator_gainprm[each, 0] != 0
-        if is_servo and model.actuator_ctrllimited[each]:
-            ranges.append(model.actuator_ctrlrange[each])
-    low = max((float(low) for low, _ in ranges), default=-np.pi)
-    high = min((float(high) for _, high in ranges), default=np.pi)
-    return low, high
 
 
 def _in_one_line(error: Exception) -> str:

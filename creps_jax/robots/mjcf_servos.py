@@ -1,0 +1,82 @@
+"""Read the motors of a model: the torque and the range of each joint."""
+
+import mujoco
+import numpy as np
+
+# Only `humanoid_from_mjcf` is public.
+__all__: list[str] = []
+
+_HINGE = mujoco.mjtJoint.mjJNT_HINGE
+
+
+class Servo:
+    """What a joint's motor can do, read from the model: torque, N m, and the range of angles, rad."""
+
+    def __init__(self, torque: float, low: float, high: float) -> None:
+        self.torque, self.low, self.high = torque, low, high
+
+
+def read_servos_of(model: mujoco.MjModel, max_torque: float | int | None) -> dict[str, Servo]:
+    """Read the motor of each hinge joint: the smallest torque limit of joint and actuators, and the range.
+
+    Args:
+        model: The compiled robot.
+        max_torque: Torque of the motors whose limit the model does not state, N m.
+
+    Raises:
+        ValueError: If a joint is no hinge, or has no name, no actuator or no torque limit.
+    """
+    servos = {}
+    for joint in range(model.njnt):
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            continue
+        name = model.joint(joint).name
+        if model.jnt_type[joint] != _HINGE:
+            raise ValueError(f"all joints of the robot must be hinges, got {name!r}, which is none")
+        if not name:
+            body = model.body(model.jnt_bodyid[joint]).name
+            raise ValueError(f"each joint of the robot must have a name, got none for one of body {body!r}")
+        is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        actuators = np.flatnonzero(is_joint & (model.actuator_trnid[:, 0] == joint))
+        if not len(actuators):
+            raise ValueError(f"each joint must have an actuator in the model, got none for {name!r}")
+        torque = _torque_limit(model, joint, actuators)
+        if not np.isfinite(torque):
+            if max_torque is None:
+                raise ValueError(
+                    f"the torque of {name!r} must have a limit: its joint has no actuatorfrcrange, and its "
+                    "actuator no forcerange; name one in the model, or max_torque in the spec"
+                )
+            torque = float(max_torque)
+        if torque <= 0.0:
+            raise ValueError(
+                f"the torque of {name!r} must have a limit above 0 in both directions, got {torque:g}"
+            )
+        servos[name] = Servo(torque, *_range_of(model, joint, actuators))
+    return servos
+
+
+def _torque_limit(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> float:
+    limits = [np.abs(model.jnt_actfrcrange[joint]).min()] if model.jnt_actfrclimited[joint] else []
+    for each in actuators:
+        gear = abs(model.actuator_gear[each, 0])
+        if model.actuator_forcelimited[each]:
+            limits.append(gear * np.abs(model.actuator_forcerange[each]).min())
+        is_motor = model.actuator_biastype[each] == mujoco.mjtBias.mjBIAS_NONE
+        if is_motor and model.actuator_ctrllimited[each]:
+            gain = abs(model.actuator_gainprm[each, 0])
+            limits.append(gear * gain * np.abs(model.actuator_ctrlrange[each]).min())
+    return float(min(limits, default=np.inf))
+
+
+def _range_of(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> tuple[float, float]:
+    """Return the range of a joint, or that of the set-points of its position servo, or a whole turn."""
+    ranges = [model.jnt_range[joint]] if model.jnt_limited[joint] else []
+    for each in actuators:
+        is_servo = model.actuator_biastype[each] == mujoco.mjtBias.mjBIAS_AFFINE
+        is_servo &= model.actuator_biasprm[each, 1] == -model.actuator_gainprm[each, 0] != 0
+        if is_servo and model.actuator_ctrllimited[each]:
+            ranges.append(model.actuator_ctrlrange[each])
+    low = max((float(low) for low, _ in ranges), default=-np.pi)
+    high = min((float(high) for _, high in ranges), default=np.pi)
+    return low, high
