@@ -175,7 +175,14 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         friction=(0.01, 0.005, 0.0001),
         material=floor.name,
     )
-    spec.worldbody.add_light(pos=(0.0, 0.0, 3.0), dir=(0.0, 0.3, -1.0), diffuse=(0.5, 0.5, 0.5))
+    spec.worldbody.add_light(
+        pos=(0.0, 0.0, 3.0),
+        dir=(0.3, 0.4, -1.0),
+        diffuse=(0.55, 0.55, 0.55),
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+    )
+    spec.visual.map.shadowclip, spec.visual.quality.shadowsize = 3.0, 4096
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = (0.4, 0.4, 0.4), (0.35, 0.35, 0.35)
     if not any(texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX for texture in spec.textures):
         spec.add_texture(
             name="creps_jax_sky",

@@ -89,7 +89,7 @@ def record(
     speeds: Sequence[float],
     *,
     seed: int,
-    robot: Robot,
+    robot: Robot | None = None,
     duration: float = 8.0,
     slopes: Sequence[float] | None = None,
 ) -> list[Clip]:
@@ -99,7 +99,7 @@ def record(
         policy: a policy of which the context is speed, or speed and slope.
         speeds: asked speeds, m/s.
         seed: seed of the noise.
-        robot: the robot of the policy.
+        robot: the robot; None is the robot that the policy names.
         duration: length of the walks, s.
         slopes: slope of each walk, deg, for a policy with a slope in its context.
 
@@ -114,7 +114,7 @@ def record(
     )
     # MJX would take longer to compile than a few walks take in C MuJoCo.
     settings = {"duration": duration, "balance": balance_of(policy), "physics": c.make_control_step}
-    settings |= {"robot": robot, "com": policy.task.get("com", "one_step")}
+    settings |= {"robot": robot or robot_of(policy), "com": policy.task.get("com", "one_step")}
     if slopes is not None:
         settings["conditions"] = (slope(policy.contexts.low[1], policy.contexts.high[1]),)
     walk = jax.jit(jax.vmap(lambda key, theta, way: record_walk(key, theta, values=way, **settings)))
