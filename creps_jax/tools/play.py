@@ -230,9 +230,9 @@ def robot_of(policy: Learned, robot: str | None = None) -> Robot:
     name, spec = str(policy.task.get("robot", NAO.name)), str(policy.task.get("spec", ""))
     if robot is None:
         if name not in ROBOTS and not (is_spec(spec) and Path(spec).is_file()):
+            where = f"described by {spec}, which is not there" if spec else f"not of {', '.join(ROBOTS)}"
             raise UserError(
-                f"the policy is of the robot {name!r}, described by {spec or 'no file'}, which is not there: "
-                "name its file with --robot"
+                f"the policy is of the robot {name!r}, {where}: name the file that describes it with --robot"
             )
         robot = name if name in ROBOTS else spec
     found = find_robot(robot).robot

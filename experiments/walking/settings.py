@@ -52,7 +52,7 @@ class Settings:
     and RBF width of the scripts that the paper's author published; DEVIATIONS.md lists the differences.
 
     Attributes:
-        robot: robot that walks: nao, nao_h25, or the .toml file that describes a humanoid.
+        robot: robot that walks: nao, nao_h25 or the .toml file that describes a humanoid.
         iterations: iterations of learning.
         trials: trials, all learned at once.
         samples: new samples of each trial in an iteration.

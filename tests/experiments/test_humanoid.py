@@ -77,7 +77,8 @@ def test_its_policy_is_played_driven_and_exported(learned, spec, tmp_path, monke
     option = ["--robot", str(spec)] if named else []
     policy = ["--policy", str(learned / "policy.npz"), *option]
     (tmp_path / "commands.csv").write_text("time,vx,vy,turn\n0,0.1,0,0\n0.5,0,0,0\n")
-    assert tools(["play", *policy, "--speed", "0.1"]) == 0
+    speed = find_robot(str(spec)).low
+    assert tools(["play", *policy, "--speed", f"{speed:.6f}"]) == 0
     assert tools(["drive", *policy, "--script", "commands.csv"]) == 0
     for to in ("walk.c", "policy.h"):
         assert tools(["export", *policy, "--to", to]) == 0
@@ -87,7 +88,7 @@ def test_its_policy_is_played_driven_and_exported(learned, spec, tmp_path, monke
 def test_a_policy_whose_description_has_moved_asks_for_it(learned, spec, tmp_path):
     saved = load(learned / "policy.npz")
     moved = dataclasses.replace(saved, task={**saved.task, "spec": str(tmp_path / "gone.toml")})
-    with pytest.raises(UserError, match=r"described by .*gone.toml, which is not there: name its file with"):
+    with pytest.raises(UserError, match=r"described by .*gone.toml, which is not there: name the file"):
         play.robot_of(moved)
     assert play.robot_of(moved, str(spec)).name == saved.task["robot"]
     with pytest.raises(UserError, match=r"the policy is of the robot .*, not of nao"):

@@ -177,7 +177,7 @@ def listed(names):
 def test_the_help_lists_the_values_of_settings():
     text = " ".join((walk.Settings.__doc__ or "").split())
     for name, values in (
-        ("robot: robot that walks", ROBOTS),
+        ("robot: robot that walks", [*ROBOTS, "the .toml file that describes a humanoid"]),
         ("bounds: bounds of the parameters", BOUNDS),
         ("constraint: limit on the parameters at their bounds", RUN_CONSTRAINTS),
         ("sampler: distribution of the contexts in learning", SAMPLERS),
@@ -306,7 +306,7 @@ def test_a_robot_brings_its_speeds_and_its_box_and_is_kept_with_the_policy(monke
     dataclasses.replace(saved, task={"balance": saved.task["balance"]}).save(tmp_path / "old.npz")
     assert robot_of(load_walking_policy(tmp_path / "old.npz", "nao")) is NAO
     dataclasses.replace(saved, task={**saved.task, "robot": "pepper"}).save(tmp_path / "odd.npz")
-    with pytest.raises(UserError, match=r"odd\.npz: unknown robot 'pepper', choose from: nao, nao_h25"):
+    with pytest.raises(UserError, match=r"odd\.npz: .* robot 'pepper', not of nao, nao_h25: name the file"):
         load_walking_policy(tmp_path / "odd.npz")
 
 
@@ -319,7 +319,7 @@ def test_a_policy_of_another_robot_is_refused(bench, capsys, command):
     settings = walk.SETTINGS["quick"]
     walk_learning.as_learned(settings, walk_learning.first_policy(settings)).save(Path("p.npz"))
     assert tools([*command, "--policy", "p.npz", "--robot", "nao_h25"]) == 2
-    assert capsys.readouterr().err == "error: p.npz is a policy of the robot nao, not of nao_h25\n"
+    assert capsys.readouterr().err == "error: p.npz: the policy is of the robot nao, not of nao_h25\n"
     assert not Path("w.csv").exists() and not bench
 
 

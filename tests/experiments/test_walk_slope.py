@@ -122,8 +122,9 @@ def test_speeds_that_the_first_policy_does_not_know_are_refused(settings):
 
 
 def test_films_show_each_walk_on_its_slope(settings, monkeypatch):
-    def recorded(key, theta, *, values, duration, balance, physics, conditions, robot):
+    def recorded(key, theta, *, values, duration, balance, physics, conditions, robot, com):
         del key, theta, balance, physics, robot
+        assert com == "one_step"
         assert [condition.name for condition in conditions] == ["slope"]
         time = 0.02 * jnp.arange(1.0, 1 + round(duration / 0.02))
         qpos = jnp.zeros((len(time), 29)).at[:, 0].set(0.1 * values[0] * time)

@@ -97,7 +97,7 @@ def test_an_interrupt_within_a_callback_is_not_lost(monkeypatch):
         ([], 0, "python -m experiments run walk", ""),
         (["--help"], 0, "python -m experiments check", ""),
         (["list"], 0, "fig05_sinus", ""),
-        (["list"], 0, "presets: quick, paper, author, best", ""),
+        (["list"], 0, "presets: quick, humanoid, paper, author, best", ""),
         (["run", "wlak"], 2, "", "error: unknown experiment 'wlak', did you mean 'walk'?"),
         (["run", "walk", "--preset", "quik"], 2, "", "error: unknown preset 'quik', did you mean 'quick'?"),
         (
