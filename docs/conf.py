@@ -40,7 +40,7 @@ nitpicky = True
 nitpick_ignore_regex = [
     ("py:obj", ".*"),
     ("py:class", r"(collections|jax|jaxlib|os|jaxtyping|mujoco|np)\..+"),
-    ("py:class", "Array|ArrayLike|Bool|Features|Float|Int|Key|Path|Rewards|UInt32|ndarray"),
+    ("py:class", "Array|ArrayLike|Bool|Bounds|Features|Float|Int|Key|Path|Rewards|UInt32|ndarray"),
 ]
 
 myst_enable_extensions = ["dollarmath"]

@@ -17,7 +17,6 @@ from creps_jax.robots.robot import NAO_LEG_LENGTH
 
 __all__ = ["humanoid_from_mjcf"]
 
-Number = float | int
 GRAVITY = 9.81
 # Gains of the servos: stiffness relative to weight times leg, and the damping time for a NAO's leg, s.
 # At a quarter of this stiffness robots of 20 to 33 kg fall in all gaits.
@@ -35,15 +34,15 @@ def humanoid_from_mjcf(
     right_leg: Sequence[str],
     feet: Sequence[str],
     name: str | None = None,
-    crouch: Sequence[Number] | None = None,
-    held: Mapping[str, Number] | None = None,
-    arm_swing: Mapping[str, Number] | None = None,
-    kp: Number | None = None,
-    kv: Number | None = None,
-    max_speed: Number | Mapping[str, Number] | None = None,
-    max_torque: Number | None = None,
-    foot_spacing: Number | None = None,
-    speeds: Sequence[Number] | None = None,
+    crouch: Sequence[float | int] | None = None,
+    held: Mapping[str, float | int] | None = None,
+    arm_swing: Mapping[str, float | int] | None = None,
+    kp: float | int | None = None,
+    kv: float | int | None = None,
+    max_speed: float | int | Mapping[str, float | int] | None = None,
+    max_torque: float | int | None = None,
+    foot_spacing: float | int | None = None,
+    speeds: Sequence[float | int] | None = None,
 ) -> Humanoid:
     """Read a humanoid from its MuJoCo model, so that it can walk.
 
@@ -160,9 +159,9 @@ def _assembled(
     *,
     name: str,
     arm_swing: tuple[float, ...],
-    gains: tuple[Number | None, Number | None],
+    gains: tuple[float | int | None, float | int | None],
     max_speeds: tuple[float, ...],
-    foot_spacing: Number | None,
+    foot_spacing: float | int | None,
     speeds: tuple[float, float] | None,
 ) -> Humanoid:
     """Derive lengths, centre of mass and gains, and put the record together."""
@@ -206,7 +205,7 @@ def _assembled(
 
 
 def _servo_gains(
-    gains: tuple[Number | None, Number | None], mass: float, length: float
+    gains: tuple[float | int | None, float | int | None], mass: float, length: float
 ) -> tuple[float, float]:
     """Return stiffness and damping of the servos: the given ones, or those from weight and leg."""
     kp, kv = gains

@@ -24,7 +24,7 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
         path: The TOML file.
 
     Raises:
-        UserError: If the file cannot be read, has a key that is unknown or missing, or the robot cannot be
+        ValueError: If the file cannot be read, has a key that is unknown or missing, or the robot cannot be
             made of it, see `humanoid_from_mjcf`.
     """
     # MuJoCo is imported only where a robot is read.
