@@ -92,7 +92,7 @@ def humanoid_from_mjcf(
     mjcf_settings.check_number("foot_spacing", foot_spacing, above=0.0)
     speeds = None if speeds is None else mjcf_settings.checked_speeds(speeds)
     spec = mjcf_model.read_spec(path)
-    model = mjcf_model.compiled(spec, path)
+    bare, model = mjcf_model.without_meshes(spec, path)
     servos = read_servos_of(model, max_torque)
     legs = _read_legs(model, spec, joints, feet)
     names = tuple(servos)
@@ -104,7 +104,7 @@ def humanoid_from_mjcf(
     posture = mjcf_posture.standing_posture(chains, legs, soles, names, held, crouches)
     mjcf_posture.check_kinematics(model, chains, legs, soles, held)
     return _assembled(
-        spec, model, source, chains, legs, soles, servos, posture,
+        (spec, bare, model), source, chains, legs, soles, servos, posture,
         name=name or path.stem,
         arm_swing=tuple(swing.get(joint, 0.0) for joint in names),
         gains=(kp, kv),
@@ -148,8 +148,7 @@ def _read_chains(
 
 
 def _assembled(
-    spec: mujoco.MjSpec,
-    model: mujoco.MjModel,
+    read: tuple[mujoco.MjSpec, mujoco.MjSpec, mujoco.MjModel],
     source: Mapping[str, Any],
     chains: Sequence[LegChain],
     legs: Sequence[Leg],
@@ -164,13 +163,17 @@ def _assembled(
     foot_spacing: float | int | None,
     speeds: tuple[float, float] | None,
 ) -> Humanoid:
-    """Derive lengths, centre of mass and gains, and put the record together."""
+    """Derive lengths, centre of mass and gains, and put the record together.
+
+    `read` is the robot as it was read, without its meshes, and compiled.
+    """
+    spec, bare, model = read
     names = tuple(servos)
     left, right = chains
     length = mjcf_legs.leg_length(left, legs[0])
     hip_x, _, hip_z = left.points[mjcf_legs.pitch_joints(left.axes, legs[0])[0]]
     com = mjcf_legs.posed(model, dict(zip(names, posture.tolist(), strict=True))).subtree_com[1]
-    servo_gains = dict.fromkeys(names, _servo_gains(gains, float(model.body_subtreemass[1]), length))
+    servo_gains = _servo_gains(gains, float(model.body_subtreemass[1]), length)
     lower, upper = _limits(servos, chains, legs)
     left_leg, right_leg = (tuple(names.index(joint) for joint in leg.joints) for leg in legs)
     slow, fast = (float(np.sqrt(length / NAO_LEG_LENGTH) * speed) for speed in _NAO_SPEEDS)
@@ -197,8 +200,8 @@ def _assembled(
         own_signs=(1.0,) * len(names),
         left=left,
         right=right,
-        model=mjcf_model.walking_model(spec, {leg.foot: leg.geoms for leg in legs}, servos, servo_gains),
-        film_model=mjcf_model.film_model(spec, servos, servo_gains),
+        model=mjcf_model.walking_model(bare, legs[0].geoms + legs[1].geoms, servos, servo_gains),
+        film_model=mjcf_model.film_model(spec, bare, servos, servo_gains),
         speeds=(slow, fast) if speeds is None else speeds,
         source=dict(source),
     )

@@ -54,8 +54,8 @@ def _leave_only_the_robot(spec: mujoco.MjSpec, path: Path) -> None:
     _delete(spec, others, spec.keys, spec.sensors)
 
 
-def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
-    """Compile a model without the meshes, whose files may be missing.
+def without_meshes(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
+    """Return a robot without its meshes, whose files may be missing, and its compiled model.
 
     Masses that the full model computes from meshes are kept.
 
@@ -66,7 +66,7 @@ def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     _keep_masses(spec)
     _delete_meshes(spec)
     try:
-        return spec.compile()
+        return spec, spec.compile()
     except ValueError as error:
         raise ValueError(
             f"the model {path} must compile without its meshes: {_in_one_line(error)}"
@@ -74,10 +74,7 @@ def compiled(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
 
 
 def walking_model(
-    spec: mujoco.MjSpec,
-    feet: Mapping[str, Sequence[str]],
-    servos: Mapping[str, Servo],
-    gains: Mapping[str, tuple[float, float]],
+    bare: mujoco.MjSpec, soles: Sequence[str], servos: Mapping[str, Servo], gains: tuple[float, float]
 ) -> mujoco.MjModel:
     """Return the model in which a robot walks.
 
@@ -85,17 +82,14 @@ def walking_model(
     `servos`, and contacts of the solids with the floor only. The friction is that of the feet.
 
     Args:
-        spec: The robot as it was read.
-        feet: Names of the geoms under each foot body.
+        bare: The robot without its meshes.
+        soles: Names of the geoms under the feet.
         servos: The motor of each joint.
-        gains: Stiffness (N m/rad) and damping (N m s/rad) of the servo of each joint.
+        gains: Stiffness (N m/rad) and damping (N m s/rad) of the servos.
     """
-    spec = spec.copy()
-    _keep_masses(spec)
+    spec = bare.copy()
     frictions = _pair_frictions(spec)
-    _delete_meshes(spec)
     _set_up(spec, servos, gains)
-    soles = {name for names in feet.values() for name in names}
     for geom in spec.geoms:
         is_solid = geom.contype != 0 or geom.conaffinity != 0
         geom.contype, geom.conaffinity = (_SOLID if is_solid else 0), 0
@@ -108,27 +102,23 @@ def walking_model(
 
 
 def film_model(
-    spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: Mapping[str, tuple[float, float]]
+    spec: mujoco.MjSpec, bare: mujoco.MjSpec, servos: Mapping[str, Servo], gains: tuple[float, float]
 ) -> mujoco.MjModel:
-    """Return the model with which a robot is drawn: with its meshes, if their files are there."""
-    for is_full in (True, False):
-        drawn = spec.copy()
-        if not is_full:
-            _keep_masses(drawn)
-            _delete_meshes(drawn)
-        _set_up(drawn, servos, gains)
-        _add_floor(drawn)
-        try:
-            return drawn.compile()
-        except ValueError:
-            if not is_full:
-                raise
-    raise AssertionError("unreachable")
+    """Return the model with which a robot is drawn: with its meshes, or bare if their files are missing."""
+    try:
+        return _drawn(spec, servos, gains)
+    except ValueError:
+        return _drawn(bare, servos, gains)
 
 
-def _set_up(
-    spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: Mapping[str, tuple[float, float]]
-) -> None:
+def _drawn(spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: tuple[float, float]) -> mujoco.MjModel:
+    spec = spec.copy()
+    _set_up(spec, servos, gains)
+    _add_floor(spec)
+    return spec.compile()
+
+
+def _set_up(spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: tuple[float, float]) -> None:
     """Delete the geoms of the world, give the robot servos, and set the solver."""
     for geom in [geom for geom in spec.geoms if geom.parent.name == "world"]:
         spec.delete(geom)
@@ -136,9 +126,9 @@ def _set_up(
     for joint in spec.joints:
         if joint.name in servos:
             joint.actfrclimited = False
+    stiffness, damping = gains
     for name, servo in servos.items():
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        stiffness, damping = gains[name]
         actuator.set_to_position(kp=stiffness, kv=damping)
         actuator.ctrllimited, actuator.ctrlrange = True, (servo.low, servo.high)
         actuator.forcelimited, actuator.forcerange = True, (-servo.torque, servo.torque)

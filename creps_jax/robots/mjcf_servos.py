@@ -1,5 +1,7 @@
 """Read the motors of a model: the torque and the range of each joint."""
 
+from typing import NamedTuple
+
 import mujoco
 import numpy as np
 
@@ -9,11 +11,12 @@ __all__: list[str] = []
 _HINGE = mujoco.mjtJoint.mjJNT_HINGE
 
 
-class Servo:
+class Servo(NamedTuple):
     """What a joint's motor can do, read from the model: torque, N m, and the range of angles, rad."""
 
-    def __init__(self, torque: float, low: float, high: float) -> None:
-        self.torque, self.low, self.high = torque, low, high
+    torque: float
+    low: float
+    high: float
 
 
 def read_servos_of(model: mujoco.MjModel, max_torque: float | int | None) -> dict[str, Servo]:
