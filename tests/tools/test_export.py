@@ -343,7 +343,7 @@ def test_the_walk_of_a_humanoid_is_written(folder, capsys):
     # Without its file the robot is not known.
     capsys.readouterr()
     assert main(["export", "--policy", "humanoid.npz", "--to", "walk.c"]) == 2
-    assert "name its file with --robot" in capsys.readouterr().err
+    assert "name the file that describes it with --robot" in capsys.readouterr().err
 
 
 def test_mistakes_are_one_clear_line(folder, capsys):
