@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -27,15 +28,15 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
 
     Returns:
         Arrays of the learning (trials, iterations), the policies, their parameters over the speeds
-        (trials, n, d), the evaluation (trials, n, seeds) and, for several trials, `trial_reward` (trials,):
-        the mean reward at the same speeds in the noise of learning, by which a trial is chosen.
+        (trials, n, d), the evaluation (trials, n, seeds) and, for several policies to choose from,
+        `trial_reward` (trials,), the mean reward at the same speeds in the noise of learning, by which a
+        trial is chosen, and `kept` (trials,), the iteration whose policy is kept.
     """
     evaluate_key, learn_key = jax.random.split(key)
     if is_spec(settings.robot) and session.console is not None:
         session.console.print(robot_check.summary(robot_check.try_standard_gaits(settings.ranges())))
     states, log = learning.learn_to_walk(settings, learn_key, session=session, name="walk")
-    policy = states.policy
-    trial_reward = _trial_reward(settings, jax.random.fold_in(key, 1), policy)
+    policy, choice = _keep_best(settings, jax.random.fold_in(key, 1), states.policy, log["coef"])
     speeds, outcome = learning.walk_at_all_speeds(settings, evaluate_key, policy)
     fine = settings.speeds(51)
     policies = [
@@ -47,18 +48,38 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
         "fine_speeds": fine,
         "fine_theta": np.stack([[policy.theta(float(speed)) for speed in fine] for policy in policies]),
         "speeds": speeds,
-        **trial_reward,
+        **choice,
         **Walks.of(outcome._asdict())._asdict(),
         **dict(zip(("bound_low", "bound_high"), map(np.array, settings.box()), strict=True)),
     }
 
 
-def _trial_reward(settings: Settings, key: jax.Array, policy: LinearGaussian) -> dict[str, np.ndarray]:
-    """Walk to choose one of several trials, with other random numbers than the evaluation has."""
-    if settings.trials == 1:
-        return {}
-    _, outcome = learning.walk_at_all_speeds(settings, key, policy, noise=settings.learning_noise)
-    return {"trial_reward": outcome.reward.mean(axis=(1, 2))}
+def _keep_best(
+    settings: Settings, key: jax.Array, policy: LinearGaussian, coefs: np.ndarray
+) -> tuple[LinearGaussian, dict[str, np.ndarray]]:
+    """Keep the best of the candidates of each trial, by other random numbers than the evaluation has.
+
+    Args:
+        settings: the settings.
+        key: random key.
+        policy: the last policies (trials, ...).
+        coefs: coefficients (trials, iterations, p, d) after each iteration.
+
+    Returns:
+        The policies (trials, ...), and the arrays of the choice, see `run`.
+    """
+    trials, iterations = coefs.shape[:2]
+    if settings.candidates * trials == 1:
+        return policy, {}
+    # From the last iteration on: with one candidate it is the last policy, and of equals the latest is kept.
+    tried = np.linspace(iterations, (iterations + 1) // 2, settings.candidates).round().astype(int)
+    candidates = jax.tree.map(lambda leaf: jnp.repeat(leaf, len(tried), axis=0), policy)
+    candidates = candidates._replace(coef=jnp.asarray(coefs[:, tried - 1].reshape(-1, *coefs.shape[2:])))
+    _, outcome = learning.walk_at_all_speeds(settings, key, candidates, noise=settings.learning_noise)
+    rewards = outcome.reward.mean(axis=(1, 2)).reshape(trials, len(tried))
+    best, trial = rewards.argmax(axis=1), np.arange(trials)
+    kept = policy._replace(coef=jnp.asarray(coefs[trial, tried[best] - 1]))
+    return kept, {"trial_reward": rewards[trial, best], "kept": tried[best]}
 
 
 def learned_arrays(settings: Settings, policy: LinearGaussian, log: Log) -> dict[str, np.ndarray]:

@@ -92,6 +92,8 @@ class Settings:
             without samples on both sides the ends are learned less well than the middle.
         learning_noise: noise in learning, as a factor of the noise in the evaluation: a policy that is
             learned in more noise falls less.
+        candidates: policies of the second half of learning that walk in the noise of learning; the best of
+            them is kept. With 1 the last policy is kept.
         eval_seeds: new episodes at each speed of the table.
         physics: simulation of the robot: auto, mjx or c. MJX runs on the device, C MuJoCo on the cores of the
             host; auto is the faster of them.
@@ -126,6 +128,7 @@ class Settings:
     sampler: str = "gaussian"
     margin: float = 0.0
     learning_noise: float = 1.0
+    candidates: int = 1
     eval_seeds: int = 10
     physics: str = "auto"
 
@@ -225,12 +228,13 @@ SETTINGS = {
     ),
     "humanoid": dataclasses.replace(
         _OURS,
-        iterations=120,
+        iterations=200,
         samples=60,
         first_samples=60,
         repeats=1,
         archive_size=300,
         learning_duration=5.0,
+        candidates=5,
     ),
     "paper": Settings(trials=5, bounds="paper"),
     "author": Settings(

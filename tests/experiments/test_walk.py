@@ -117,6 +117,30 @@ def test_the_policy_is_kept_that_walks_best_in_the_noise_of_learning(bench, monk
         assert walk.chosen_trial(arrays) == best
 
 
+def test_of_several_iterations_the_best_is_kept_and_the_latest_of_equals(bench, monkeypatch):
+    settings = dataclasses.replace(walk.SETTINGS["quick"], iterations=5, candidates=3)
+    tried = []
+
+    def walks(of_candidates):
+        def walk_at_all_speeds(settings, key, policy, *, noise=1.0):
+            tried.append(np.asarray(policy.coef))
+            reward = np.array(of_candidates if len(policy.coef) == 6 else [0.0, 0.0])
+            reward = np.broadcast_to(reward[:, None, None], (len(reward), 11, 3))
+            return settings.speeds(), WalkOutcome(*[reward] * 5)
+
+        monkeypatch.setattr(walk_learning, "walk_at_all_speeds", walk_at_all_speeds)
+        return walk.run(settings, jax.random.key(0))
+
+    # Candidates of each of the two trials: the iterations 5, 4 and 3.
+    arrays = walks([-2.0, -1.0, -3.0, -1.0, -1.0, -2.0])
+    np.testing.assert_array_equal(arrays["kept"], [4, 5])
+    np.testing.assert_array_equal(arrays["trial_reward"], [-1.0, -1.0])
+    candidates, kept = tried
+    np.testing.assert_array_equal(kept, candidates[[1, 3]])
+    np.testing.assert_array_equal(arrays["coef"], kept)
+    assert not (candidates[0] == candidates[1]).all()
+
+
 @pytest.mark.usefixtures("simple_updates")
 def test_ways_to_learn_are_compared_from_the_same_start(bench, tmp_path):
     settings = dataclasses.replace(walk.SETTINGS["quick"], mean_kl_bound=0.5, cov_kl_bound=0.05)
