@@ -4,7 +4,7 @@ import contextlib
 import importlib.util
 import inspect
 import tomllib
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from creps_jax import checks
@@ -57,7 +57,7 @@ def _model_path(spec: Path, model: Any) -> Path:
     if not isinstance(model, str):
         raise UserError(f"model in {spec} must be a path, or package:path, got {model!r}")
     package, colon, inside = model.partition(":")
-    if not colon:
+    if not colon or PureWindowsPath(model).is_absolute():
         return spec.parent / model
     folders = None
     # Python raises for a module without a file, such as `__main__`.

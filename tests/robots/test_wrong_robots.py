@@ -397,6 +397,10 @@ TOMLS = {
         TOML.replace('"small.xml"', "3"),
         "model in .*small.toml must be a path, or package:path, got 3$",
     ),
+    "a path of Windows": (
+        TOML.replace("small.xml", "C:/no/big.xml"),
+        "the model must be an MJCF file, got .*C:/no/big.xml",
+    ),
     "no model": (TOML.replace("small.xml", "big.xml"), "the model must be an MJCF file, got .*big.xml"),
     "no package": (
         TOML.replace("small.xml", "no_such_package:small.xml"),
