@@ -104,11 +104,15 @@ def walking_model(
 def film_model(
     spec: mujoco.MjSpec, bare: mujoco.MjSpec, servos: Mapping[str, Servo], gains: tuple[float, float]
 ) -> mujoco.MjModel:
-    """Return the model with which a robot is drawn: with its meshes, or bare if their files are missing."""
+    """Return the model with which a robot is drawn: its meshes, or its solids if mesh files are missing."""
     try:
         return _drawn(spec, servos, gains)
     except ValueError:
-        return _drawn(bare, servos, gains)
+        shown = bare.copy()
+        # Solids beside meshes are often in a group that is not drawn.
+        for geom in shown.geoms:
+            geom.group = 0
+        return _drawn(shown, servos, gains)
 
 
 def _drawn(spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: tuple[float, float]) -> mujoco.MjModel:

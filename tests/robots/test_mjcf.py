@@ -407,10 +407,16 @@ def test_a_model_whose_mesh_files_are_missing_is_read_and_drawn_without(tmp_path
     other = read(
         tmp_path,
         shell,
-        (drawn, drawn + '<geom type="mesh" mesh="shell" contype="0" conaffinity="0" mass="0"/>'),
+        (
+            drawn,
+            drawn.replace("<geom ", '<geom group="3" ', 1)
+            + '<geom type="mesh" mesh="shell" contype="0" conaffinity="0" mass="0"/>',
+        ),
     )
     np.testing.assert_allclose(other.model.body_mass, robot.model.body_mass)
     assert other.film_model.nmesh == 0 == other.model.nmesh
+    # Group 3 is not drawn.
+    assert other.model.geom_group.any() and not other.film_model.geom_group.any()
     assert other.posture == pytest.approx(robot.posture)
 
 
