@@ -65,6 +65,16 @@ class Plan:
         return self.repeats * (first + self.samples * (np.asarray(iteration) - 1))
 
 
+def candidate_iterations(iterations: int, num: int) -> np.ndarray:
+    """Return indices of `num` equally spaced iterations of the second half of learning, with the last one.
+
+    Indices rise. There are fewer if the second half has fewer iterations.
+    """
+    last = iterations - 1
+    # From the last iteration on: with one candidate it is the last policy.
+    return np.unique(np.linspace(last, last // 2, num).round().astype(int))
+
+
 def trial_keys(key: jax.Array, trials: int) -> jax.Array:
     """Return a key for each trial; it does not depend on the number of trials."""
     return jax.vmap(lambda trial: jax.random.fold_in(key, trial))(jnp.arange(trials, dtype=jnp.uint32))

@@ -33,7 +33,7 @@ from creps_jax.walking.controller import Stage, Walker
 from creps_jax.walking.gaits import COMMAND_NAMES, COMMAND_UNITS, learned_walker
 from creps_jax.walking.params import NAO_STEERED_BOUNDS, STEERED_PARAM_NAMES, STEERED_PARAM_UNITS
 from creps_jax.walking.posture import Balance
-from experiments.learning import Plan, Session, learn, trial_keys
+from experiments.learning import Plan, Session, candidate_iterations, learn, trial_keys
 from experiments.records import Arrays, Learning, named
 from experiments.registry import Claim
 from experiments.walking.settings import PHYSICS, TIMESTEP
@@ -336,9 +336,7 @@ def keep_steadiest(
     Returns:
         Index of the chosen iteration, and the share of time that each candidate is up, by its index.
     """
-    last = len(policies.coef) - 1
-    # From the last iteration on: with one candidate it is the last policy.
-    indices = np.unique(np.linspace(last, last // 2, settings.candidates).round().astype(int))
+    indices = candidate_iterations(len(policies.coef), settings.candidates)
     drives = random_commands(1, settings.candidate_drives, settings.candidate_seconds)
 
     @jax.jit

@@ -15,7 +15,7 @@ from creps_jax.tools import plots, robot_check, tables
 from creps_jax.tools.play import POLICY, filmed_speeds, record, save_film
 from creps_jax.tools.robots import is_spec
 from creps_jax.walking.params import PARAM_LABELS, PARAM_NAMES, PARAM_UNITS
-from experiments.learning import Log, Session
+from experiments.learning import Log, Session, candidate_iterations
 from experiments.records import Arrays, Learning, Walks, named
 from experiments.registry import Claim
 from experiments.walking import learning
@@ -71,15 +71,15 @@ def _keep_best(
     trials, iterations = coefs.shape[:2]
     if settings.candidates * trials == 1:
         return policy, {}
-    # From the last iteration on: with one candidate it is the last policy, and of equals the latest is kept.
-    tried = np.linspace(iterations, (iterations + 1) // 2, settings.candidates).round().astype(int)
+    # The latest first: argmax keeps it among equals.
+    tried = candidate_iterations(iterations, settings.candidates)[::-1]
     candidates = jax.tree.map(lambda leaf: jnp.repeat(leaf, len(tried), axis=0), policy)
-    candidates = candidates._replace(coef=jnp.asarray(coefs[:, tried - 1].reshape(-1, *coefs.shape[2:])))
+    candidates = candidates._replace(coef=jnp.asarray(coefs[:, tried].reshape(-1, *coefs.shape[2:])))
     _, outcome = learning.walk_at_all_speeds(settings, key, candidates, noise=settings.learning_noise)
     rewards = outcome.reward.mean(axis=(1, 2)).reshape(trials, len(tried))
     best, trial = rewards.argmax(axis=1), np.arange(trials)
-    kept = policy._replace(coef=jnp.asarray(coefs[trial, tried[best] - 1]))
-    return kept, {"trial_reward": rewards[trial, best], "kept": tried[best]}
+    kept = policy._replace(coef=jnp.asarray(coefs[trial, tried[best]]))
+    return kept, {"trial_reward": rewards[trial, best], "kept": tried[best] + 1}
 
 
 def learned_arrays(settings: Settings, policy: LinearGaussian, log: Log) -> dict[str, np.ndarray]:
