@@ -13,11 +13,10 @@ from creps_jax.robots.humanoid import Humanoid, LegChain
 from creps_jax.robots.mjcf_legs import Leg
 from creps_jax.robots.mjcf_servos import Servo, read_servos_of
 from creps_jax.robots.mjcf_soles import Sole
-from creps_jax.robots.robot import NAO_LEG_LENGTH
+from creps_jax.robots.robot import GRAVITY, NAO_LEG_LENGTH
 
 __all__ = ["humanoid_from_mjcf"]
 
-GRAVITY = 9.81
 # Gains of the servos: stiffness relative to weight times leg, and the damping time for a NAO's leg, s.
 # At a quarter of this stiffness robots of 20 to 33 kg fall in all gaits.
 _STIFFNESS, _DAMPING_TIME = 10.0, 0.01

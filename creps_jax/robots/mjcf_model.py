@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from creps_jax.robots.mjcf_servos import Servo
+from creps_jax.robots.robot import GRAVITY
 
 # Only `humanoid_from_mjcf` is public.
 __all__: list[str] = []
@@ -140,7 +141,7 @@ def _set_up(spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: tuple[float
     option.timestep, option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver, option.cone = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtCone.mjCONE_PYRAMIDAL
     option.iterations, option.ls_iterations = _ITERATIONS, _LINE_ITERATIONS
-    option.gravity, option.wind = (0.0, 0.0, -9.81), (0.0, 0.0, 0.0)
+    option.gravity, option.wind = (0.0, 0.0, -GRAVITY), (0.0, 0.0, 0.0)
     # The set-points stay within the limits, and the servos hold the joints near the set-points.
     option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
     option.enableflags = 0

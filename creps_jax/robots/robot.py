@@ -21,8 +21,10 @@ from creps_jax.robots.nao_geometry import (
     leg_indices,
 )
 
-__all__ = ["NAO", "NAO_H25", "NAO_LEG_LENGTH", "ROBOTS", "NaoRobot", "Robot"]
+__all__ = ["GRAVITY", "NAO", "NAO_H25", "NAO_LEG_LENGTH", "ROBOTS", "NaoRobot", "Robot"]
 
+GRAVITY = 9.81
+"""Acceleration of gravity, m/s^2."""
 
 NAO_LEG_LENGTH = GEOMETRY.thigh_down + GEOMETRY.shank_down
 """Distance from hip to ankle of the simulated NAO, m: lengths and times of a walk scale with the leg."""

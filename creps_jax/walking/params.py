@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from creps_jax import checks
-from creps_jax.robots.robot import NAO, Robot
+from creps_jax.robots.robot import GRAVITY, NAO, Robot
 from creps_jax.typing import Array, Float, Scalar
 
 __all__ = [
@@ -29,9 +29,6 @@ __all__ = [
 ]
 
 Bounds = tuple[tuple[float, ...], tuple[float, ...]]
-
-GRAVITY = 9.81
-"""Acceleration of gravity, m/s^2."""
 
 PARAM_NAMES = (
     "amplitude",
