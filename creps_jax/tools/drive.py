@@ -116,7 +116,7 @@ def captions(drive: Drive) -> list[str]:
     )
     return [
         f"asked {in_words(command)}, reached {in_words(reached)}{' (fell)' if fell else ''}"
-        for command, reached, fell in zip(drive.command, speed, drive.has_fallen, strict=True)
+        for command, reached, fell in zip(np.asarray(drive.command), speed, drive.has_fallen, strict=True)
     ]
 
 
