@@ -6,8 +6,8 @@ import jax.numpy as jnp
 
 from creps_jax import checks
 from creps_jax.numerics.linalg import thomas_solve
+from creps_jax.robots.robot import GRAVITY
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
-from creps_jax.walking.params import GRAVITY
 
 __all__ = ["com_trajectory", "com_velocities", "continuous_com_trajectory", "spring_height", "zmp_of_com"]
 

@@ -11,7 +11,6 @@ from creps_jax.typing import Array, Float, Scalar
 
 __all__ = [
     "AUTHOR_BOUNDS",
-    "GRAVITY",
     "HUMANOID_BOUNDS",
     "NAO_BOUNDS",
     "NAO_H25_BOUNDS",

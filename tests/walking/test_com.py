@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from creps_jax.robots.robot import GRAVITY
 from creps_jax.walking.com import com_trajectory, spring_height, zmp_of_com
-from creps_jax.walking.params import GRAVITY
 from creps_jax.walking.zmp import zmp_reference
 
 NUM_NODES = 33

@@ -16,7 +16,7 @@ from creps_jax.policies.learned import Learned
 from creps_jax.robots import legs, screw_kinematics
 from creps_jax.robots.humanoid import Humanoid
 from creps_jax.robots.nao_kinematics import leg_links, leg_reach
-from creps_jax.robots.robot import NaoRobot, Robot
+from creps_jax.robots.robot import GRAVITY, NaoRobot, Robot
 from creps_jax.tools.export.c_header import floats, identifier, number, string_literal
 from creps_jax.tools.export.formula import formula_of
 from creps_jax.typing import ScalarLike
@@ -105,7 +105,7 @@ def _engine_constants(walker: Walker) -> list[str]:
     """Define the numbers of the engine, scaled to the robot, and the settings of the walker."""
     robot, size = walker.robot, walker.robot.size
     numbers = {
-        "GRAVITY": params.GRAVITY,
+        "GRAVITY": GRAVITY,
         "HEADING_GAIN": walker.balance.heading_gain,
         "PLACEMENT_GAIN": walker.balance.placement_gain,
         "FILTER_MEMORY": posture.filter_memory(walker.period, walker.balance.filter_time),
