@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 MAX_HEADING_STEP = 0.15
-# Sideways tilt beyond which a foot is put out no further, rad.
+# Tilt beyond which a foot is put out no further, rad.
 MAX_TILT = 0.35
 
 
@@ -174,12 +174,14 @@ def pose_joints(
     heading_error = jnp.clip(wrapped(pose.hips[3] - measured_rpy[2]), -1.0, 1.0)
     heading_step = balance.heading_gain * heading_error
     turn = jnp.clip(heading_step, -MAX_HEADING_STEP, MAX_HEADING_STEP) * pose.turn
-    tilt = jnp.clip(measured_rpy[0] - vertical[0], -MAX_TILT, MAX_TILT)
-    aside = -balance.placement_gain * params.hip_height * tilt
-    aside_left, aside_right = aside * (0.5 + pose.turn), aside * (0.5 - pose.turn)
+    tilt = jnp.stack([measured_rpy[0] - vertical[0], measured_rpy[1] - intended[1]])
+    roll_error, pitch_error = jnp.clip(tilt, -MAX_TILT, MAX_TILT)
+    shift = params.hip_height * jnp.stack(
+        [balance.forward_placement_gain * pitch_error, -balance.placement_gain * roll_error]
+    )
     place = partial(_sole_in_torso, pose.hips, R_level_trunk=R_level_trunk, robot=robot)
-    T_torso_left = place(pose.left, turn=turn, aside=aside_left)
-    T_torso_right = place(pose.right, turn=-turn, aside=aside_right)
+    T_torso_left = place(pose.left, turn=turn, shift=(0.5 + pose.turn) * shift)
+    T_torso_right = place(pose.right, turn=-turn, shift=(0.5 - pose.turn) * shift)
     left, right = solve_legs(T_torso_left, T_torso_right, last, robot=robot)
     ahead = jnp.cos(pose.hips[3]) * (pose.left[0] - pose.right[0]) + jnp.sin(pose.hips[3]) * (
         pose.left[1] - pose.right[1]
@@ -192,15 +194,15 @@ def pose_joints(
     return jnp.clip(targets, *limits)
 
 
-def _sole_in_torso(hips, sole, *, R_level_trunk, turn, aside, robot):
+def _sole_in_torso(hips, sole, *, R_level_trunk, turn, shift, robot):
     """Transform a sole from the world into the frame of a trunk that leans about the middle of its hips.
 
-    The sole is turned by `turn` about the hips and put `aside` to the left.
+    The sole is turned by `turn` about the hips and shifted by `shift` forward and to the left, m.
     """
     R_trunk_level = R_level_trunk.T
     R_heading = rotation_z(turn - hips[3])
     x, z = robot.hip_centre
     hip_centre = jnp.array([x, 0.0, z], hips.dtype)
-    from_hips = R_heading @ (sole[:3] - hips[:3]) + aside * jnp.array([0.0, 1.0, 0.0], hips.dtype)
+    from_hips = (R_heading @ (sole[:3] - hips[:3])).at[:2].add(shift)
     position = R_trunk_level @ from_hips + hip_centre
     return rigid_transform(R_trunk_level @ R_heading @ rotation_z(sole[3]), position)

@@ -24,11 +24,15 @@ class Balance(NamedTuple):
             while the body is carried over.
         filter_time: Time constant of the filter for the measured roll and pitch, s, see `next_tilt`; 0 for
             no filter.
+        forward_placement_gain: The same share as `placement_gain`, forwards: a landing foot is put ahead of a
+            trunk that leans farther forward than intended, and behind one that leans back. A robot whose feet
+            are short for its legs needs it.
     """
 
     heading_gain: ScalarLike = 0.0
     placement_gain: ScalarLike = 0.0
     filter_time: ScalarLike = 0.0
+    forward_placement_gain: ScalarLike = 0.0
 
 
 class Tilt(NamedTuple):

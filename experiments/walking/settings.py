@@ -83,6 +83,8 @@ class Settings:
         heading_gain: share of the heading error that a step turns back; 0 is the paper's engine.
         placement_gain: shift of the landing foot towards the side of the tilt, see `Balance`; 0 is the
             paper's engine.
+        forward_placement_gain: the same forwards, against the error of the pitch, see `Balance`; 0 is the
+            paper's engine. None is 0 for a NAO and 0.25 for other robots.
         filter_time: time constant of the filter for the measured tilt, s, see `Balance`; 0 is no filter. None
             is 0 for a NAO and 0.06 for other robots.
         upright: share of the cost of a fall that is given back in learning in proportion to the time before
@@ -123,6 +125,7 @@ class Settings:
     learning_duration: float = 8.0
     heading_gain: float = 0.0
     placement_gain: float = 0.0
+    forward_placement_gain: float | None = None
     filter_time: float | None = None
     upright: float | None = None
     sampler: str = "gaussian"
@@ -167,14 +170,14 @@ class Settings:
         return self.ranges().bounds if self.bounds is None else BOUNDS[self.bounds]
 
     def of_robot(self, name: str) -> Any:
-        """Return `com`, `filter_time` or `upright`, by default as it fits the robot."""
+        """Return a setting that is None by default, as it fits the robot."""
         given = getattr(self, name)
         return self._of_robot()[name] if given is None else given
 
     def _of_robot(self) -> dict[str, Any]:
         if self.robot in ROBOTS:
-            return {"com": "one_step", "filter_time": 0.0, "upright": 0.0}
-        return {"com": "continuous", "filter_time": 0.06, "upright": 0.5}
+            return {"com": "one_step", "filter_time": 0.0, "forward_placement_gain": 0.0, "upright": 0.0}
+        return {"com": "continuous", "filter_time": 0.06, "forward_placement_gain": 0.25, "upright": 0.5}
 
     def speeds(self, num: int = NUM_SPEEDS) -> np.ndarray:
         """Return `num` equally spaced speeds, m/s; by default, with the paper's robot, its 11 speeds."""
@@ -183,7 +186,8 @@ class Settings:
 
     def balance(self) -> Balance:
         """Return the gains of the response to the measured orientation."""
-        return Balance(self.heading_gain, self.placement_gain, self.of_robot("filter_time"))
+        tilt = {name: self.of_robot(name) for name in ("filter_time", "forward_placement_gain")}
+        return Balance(self.heading_gain, self.placement_gain, **tilt)
 
     def conditions(self) -> tuple[Condition, ...]:
         """Return the context variables after the speed."""

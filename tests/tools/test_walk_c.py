@@ -22,6 +22,7 @@ from creps_jax.robots.nao_geometry import JOINT_NAMES
 from creps_jax.robots.robot import NAO, NAO_H25, Robot
 from creps_jax.tools.export import walk_c
 from creps_jax.walking.gaits import learned_walker
+from creps_jax.walking.posture import Balance
 from experiments.benchmarks.exported_walk import (
     COMPILER,
     STRICT,
@@ -102,7 +103,10 @@ def test_set_points_are_those_of_python(walk, period, tmp_path):
 def test_set_points_of_a_humanoid_are_those_of_python(walk, num_leg_joints, tmp_path):
     robot = make_humanoid(tmp_path, num_leg_joints)
     com = "one_step" if walk == "walk" else "continuous"
-    assert_equal_walks(scaled_walk(robot, com, walk), robot, 0.02, 8.0, tmp_path)
+    policy = scaled_walk(robot, com, walk)
+    balance = Balance(heading_gain=0.3, placement_gain=0.6, filter_time=0.06, forward_placement_gain=0.25)
+    task = {**policy.task, "balance": balance._asdict()}
+    assert_equal_walks(dataclasses.replace(policy, task=task), robot, 0.02, 8.0, tmp_path)
 
 
 @needs_compiler

@@ -21,7 +21,7 @@ from creps_jax.robots.nao_geometry import (
     leg_indices,
 )
 from creps_jax.robots.nao_kinematics import leg_fk
-from creps_jax.robots.robot import NAO_H25
+from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.walking.controller import Gait
 from creps_jax.walking.engine import BodyPose, pose_joints, stand_upright, vertical_trunk
 from creps_jax.walking.footsteps import FOOT_SPACING, compose, next_footstep, standing
@@ -294,28 +294,37 @@ def test_heading_hold_turns_the_feet_back_and_is_off_by_default():
     assert right_foot_yaw(Balance(heading_gain=0.5)) < -0.03
 
 
-def test_a_landing_foot_is_put_out_to_where_the_robot_tips_and_that_is_off_by_default():
-    # Without roll gain the feet stay level, and the tilt alone changes nothing about where they are put.
-    theta = THETA.at[6].set(0.0)
-    step = first_step(theta)
+@pytest.mark.parametrize(
+    ("gain", "tilt", "axis", "sign"),
+    [("placement_gain", (0.1, 0.0), 1, -1.0), ("forward_placement_gain", (0.0, 0.1), 0, 1.0)],
+    ids=["sideways", "forwards"],
+)
+def test_a_landing_foot_is_put_out_to_where_the_robot_tips_and_that_is_off_by_default(gain, tilt, axis, sign):
+    # Without gains of roll and pitch the feet stay level, and the tilt alone does not move them.
+    theta = THETA.at[5:7].set(0.0)
+    step, lean = first_step(theta), params_from_theta(theta).lean
+    hips = jnp.array([NAO.hip_centre[0], 0.0, NAO.hip_centre[1]])
 
-    def sideways(phase, roll, **balance):
-        """Return how far to the left of the hips the left and the right sole are, in a level frame."""
-        measured = jnp.array([roll, 0.0, 0.0])
+    def places(phase, tilt, **balance):
+        """Return the left and the right sole seen from the hips, in a level frame."""
+        roll, pitch = tilt[0], lean + tilt[1]
+        measured = jnp.array([roll, pitch, 0.0])
         pose = straight_walker(theta).pose(at_phase(step, phase))
         targets = pose_joints(params_from_theta(theta), pose, measured, balance=Balance(**balance))
+        R_level_trunk = rotation_y(pitch) @ rotation_x(jnp.float32(roll))
         soles = [
-            rotation_x(roll) @ (leg_fk(targets[leg], side)[:3, 3] - jnp.array([0.0, 0.0, GEOMETRY.hip_z]))
+            R_level_trunk @ (leg_fk(targets[leg], side)[:3, 3] - hips)
             for leg, side in ((LEFT_LEG, LEFT), (RIGHT_LEG, RIGHT))
         ]
-        return np.array([sole[1] for sole in soles])
+        return np.array(soles)
 
-    tips_right = jnp.float32(0.1)
-    np.testing.assert_allclose(sideways(0.95, tips_right), sideways(0.95, jnp.float32(0.0)), atol=1e-4)
-    for phase, expected in ((0.02, [1.0, 0.0]), (0.98, [0.0, 1.0])):
-        moved = sideways(phase, tips_right, placement_gain=0.5) - sideways(phase, tips_right)
-        # The left foot stands in the first step, the right one lands; to the right is negative.
-        np.testing.assert_allclose(moved, -0.5 * 0.176 * 0.1 * np.array(expected), atol=3e-4)
+    np.testing.assert_allclose(places(0.95, tilt), places(0.95, (0.0, 0.0)), atol=1e-4)
+    # The left foot stands in the first step, the right one lands.
+    for phase, share in ((0.02, [1.0, 0.0]), (0.98, [0.0, 1.0])):
+        moved = places(phase, tilt, **{gain: 0.5}) - places(phase, tilt)
+        expected = np.zeros((2, 3))
+        expected[:, axis] = sign * 0.5 * 0.176 * 0.1 * np.array(share)
+        np.testing.assert_allclose(moved, expected, atol=3e-4)
 
 
 def test_a_step_holds_its_last_pose_after_its_end():

@@ -108,6 +108,7 @@ def _engine_constants(walker: Walker) -> list[str]:
         "GRAVITY": GRAVITY,
         "HEADING_GAIN": walker.balance.heading_gain,
         "PLACEMENT_GAIN": walker.balance.placement_gain,
+        "FORWARD_PLACEMENT_GAIN": walker.balance.forward_placement_gain,
         "FILTER_MEMORY": posture.filter_memory(walker.period, walker.balance.filter_time),
         "MAX_HEADING_ERROR": controller.MAX_HEADING_ERROR,
         "SIDE_BY_SIDE": controller.SIDE_BY_SIDE,

@@ -885,13 +885,15 @@ static void pose_body(const walk_state *state, body_pose *pose)
 
 /* The pose of a sole in the frame of a trunk that leans about the middle of its hips. */
 static void sole_in_torso(
-    const float hips[4], const float foot[4], const matrix *trunk_level, float turn, float aside, sole_pose *sole)
+    const float hips[4], const float foot[4], const matrix *trunk_level, float turn, float share,
+    const float shift[2], sole_pose *sole)
 {
     const matrix heading = rotation_z(turn - hips[3]), yaw = rotation_z(foot[3]);
     const float offset[3] = {foot[0] - hips[0], foot[1] - hips[1], foot[2] - hips[2]};
     float level[3];
     rotated(&heading, offset, level);
-    level[1] += aside;
+    level[0] += share * shift[0];
+    level[1] += share * shift[1];
     rotated(trunk_level, level, sole->position);
     sole->position[0] += HIP_CENTRE[0];
     sole->position[2] += HIP_CENTRE[1];
@@ -910,8 +912,10 @@ static void pose_joints(
     const float pitch = pitch_seen + params[TILT_GAIN] * (params[LEAN] - pitch_seen);
     const float error = clip(wrapped(pose->hips[3] - measured[2]), -1.0f, 1.0f);
     const float turn = clip(HEADING_GAIN * error, -MAX_HEADING_STEP, MAX_HEADING_STEP) * pose->turn;
-    const float tilt = clip(measured[0], -MAX_TILT, MAX_TILT);
-    const float aside = -PLACEMENT_GAIN * params[HIP_HEIGHT] * tilt;
+    const float roll_error = clip(measured[0], -MAX_TILT, MAX_TILT);
+    const float pitch_error = clip(measured[1] - params[LEAN], -MAX_TILT, MAX_TILT);
+    const float shift[2] = {
+        FORWARD_PLACEMENT_GAIN * params[HIP_HEIGHT] * pitch_error, -PLACEMENT_GAIN * params[HIP_HEIGHT] * roll_error};
     const float ahead = 0.5f * (cosf(pose->hips[3]) * (pose->left[0] - pose->right[0])
         + sinf(pose->hips[3]) * (pose->left[1] - pose->right[1]));
     const matrix about_x = rotation_x(roll), about_y = rotation_y(pitch);
@@ -919,8 +923,8 @@ static void pose_joints(
     sole_pose soles[2];
     int i;
 
-    sole_in_torso(pose->hips, pose->left, &trunk_level, turn, aside * (0.5f + pose->turn), &soles[0]);
-    sole_in_torso(pose->hips, pose->right, &trunk_level, -turn, aside * (0.5f - pose->turn), &soles[1]);
+    sole_in_torso(pose->hips, pose->left, &trunk_level, turn, 0.5f + pose->turn, shift, &soles[0]);
+    sole_in_torso(pose->hips, pose->right, &trunk_level, -turn, 0.5f - pose->turn, shift, &soles[1]);
     for (i = 0; i < WALK_NUM_JOINTS; ++i) {
         joints[i] = POSTURE[i] + ARM_SWING[i] * ahead;
     }
