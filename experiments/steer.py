@@ -84,6 +84,7 @@ class Settings:
             none, and falls less without.
         placement_gain: shift of the landing foot towards the side of the tilt, see `Balance`.
         filter_time: time constant of the filter for the measured roll and pitch, s; 0 for no filter.
+        forward_placement_gain: shift of the landing foot against the error of the pitch, see `Balance`.
         acceleration: largest rate of change of the command, kept with the policy: forward and sideways,
             m/s^2, and turning, rad/s^2.
         learning_acceleration: the same in learning: faster changes are harder.
@@ -115,6 +116,7 @@ class Settings:
     heading_gain: float = 0.0
     placement_gain: float = 0.5
     filter_time: float = 0.06
+    forward_placement_gain: float = 0.0
     acceleration: tuple[float, float, float] = (0.7, 0.08, 0.4)
     learning_acceleration: tuple[float, float, float] = (0.6, 0.4, 2.0)
     com: str = "continuous"
@@ -125,7 +127,7 @@ class Settings:
 
     def balance(self) -> Balance:
         """Return the gains of the response to the measured orientation."""
-        return Balance(self.heading_gain, self.placement_gain, self.filter_time)
+        return Balance(self.heading_gain, self.placement_gain, self.filter_time, self.forward_placement_gain)
 
     def features(self) -> FeatureMap:
         """Return the features of the command: all products up to a degree."""

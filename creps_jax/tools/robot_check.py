@@ -27,7 +27,7 @@ _PARAMETERS = {
     "double_support": 0.02,
     "step_growth": 0.1,
 }
-_BALANCE = Balance(0.3, 0.6, 0.06)
+_BALANCE = Balance(0.3, 0.6, 0.06, 0.25)
 _SECONDS = 5.0
 
 

@@ -1,7 +1,8 @@
 """Evaluate a walking policy at 11 speeds, with 50 new episodes each, and compare it with the paper's Table 2.
 
     python -m experiments.benchmarks.policy [POLICY.npz] [--robot NAME] [--speeds N] [--episodes N]
-                                            [--noise TIMES] [--placement-gain GAIN] [--seed SEED]
+                                            [--noise TIMES] [--placement-gain GAIN]
+                                            [--forward-placement-gain GAIN] [--seed SEED]
 
 Without a file the policy is the shipped one of the robot. `--robot` may be the .toml file that describes a
 humanoid. The last options test a policy in more noise, or with another gain of the foot placement than it was
@@ -37,6 +38,7 @@ def main(
     episodes: int = SEEDS,
     noise: float = 1.0,
     placement_gain: float | None = None,
+    forward_placement_gain: float | None = None,
     seed: int = 2026,
 ) -> None:
     """Measure a policy and print its table.
@@ -48,12 +50,12 @@ def main(
         episodes: Number of episodes at each speed.
         noise: Factor of the usual noise.
         placement_gain: Gain of the foot placement; by default the one that the policy was learned with.
+        forward_placement_gain: The same for the foot placement forwards.
         seed: Seed of the noise.
     """
     saved = load_walking_policy(policy or shipped_policy(robot), robot)
-    balance = balance_of(saved)
-    if placement_gain is not None:
-        balance = balance._replace(placement_gain=placement_gain)
+    gains = {"placement_gain": placement_gain, "forward_placement_gain": forward_placement_gain}
+    balance = balance_of(saved)._replace(**{name: gain for name, gain in gains.items() if gain is not None})
     asked = speeds_of(saved, speeds)
     task = nao_walk(
         float(asked[0]),

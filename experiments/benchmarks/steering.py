@@ -32,9 +32,7 @@ def main(policy: tyro.conf.Positional[Path | None] = None, drives: int = 50, see
     settings = dataclasses.replace(
         steer.SETTINGS["quick"],
         drives=drives,
-        heading_gain=balance.heading_gain,
-        placement_gain=balance.placement_gain,
-        filter_time=balance.filter_time,
+        **balance._asdict(),
         com=learned.task["com"],
         acceleration=tuple(learned.task["acceleration"]),
     )
