@@ -1,4 +1,4 @@
-"""Make a walking humanoid of an MJCF file and a short description; the rest is derived from the model."""
+"""Make a walking humanoid from an MJCF file and a short description; the rest is derived from the model."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from creps_jax import checks
-from creps_jax.robots import mjcf_legs, mjcf_model, mjcf_posture, mjcf_settings, mjcf_soles
+from creps_jax.robots import mjcf_legs, mjcf_model, mjcf_posture, mjcf_read, mjcf_settings, mjcf_soles
 from creps_jax.robots.humanoid import Humanoid, LegChain
 from creps_jax.robots.mjcf_legs import Leg
 from creps_jax.robots.mjcf_servos import Servo, read_servos_of
@@ -47,7 +47,8 @@ def humanoid_from_mjcf(
 
     The trunk is the body with the free joint; it must face along x. From the model come the joint axes, the
     soles, the lengths, the centre of mass, and the limits of joints and motors. Each joint gets a position
-    servo. Meshes take no part in contacts; the feet need a box, sphere, capsule, cylinder or ellipsoid.
+    servo. Meshes take no part in contacts; the feet need a box, sphere, capsule, cylinder or ellipsoid. The
+    world, the options, the constraints to the world and the gravity compensation of the file do not apply.
 
     Args:
         path: The MJCF file.
@@ -90,7 +91,7 @@ def humanoid_from_mjcf(
     mjcf_settings.check_number("max_torque", max_torque, above=0.0)
     mjcf_settings.check_number("foot_spacing", foot_spacing, above=0.0)
     speeds = None if speeds is None else mjcf_settings.checked_speeds(speeds)
-    spec = mjcf_model.read_spec(path)
+    spec = mjcf_read.read_spec(path)
     bare, model = mjcf_model.without_meshes(spec, path)
     servos = read_servos_of(model, max_torque)
     legs = _read_legs(model, spec, joints, feet)

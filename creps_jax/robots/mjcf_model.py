@@ -6,6 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from creps_jax.robots.mjcf_read import delete, in_one_line
 from creps_jax.robots.mjcf_servos import Servo
 from creps_jax.robots.robot import GRAVITY
 
@@ -16,43 +17,9 @@ TIMESTEP = 0.004
 _ITERATIONS, _LINE_ITERATIONS = 10, 10
 # Contact bits: the floor touches every solid, and the feet also touch each other.
 _FLOOR, _SOLID, _FOOT = 1, 2, 4
+_NEVER = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+_ALWAYS = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
 _MESH, _PLANE = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_PLANE
-# Largest number of characters of MuJoCo's message in an error.
-_WIDTH = 160
-
-
-def read_spec(path: Path) -> mujoco.MjSpec:
-    """Read the robot of an MJCF file without the rest of its world, and name the geoms that have no name.
-
-    Raises:
-        ValueError: If it cannot be read, or has not one robot with a free joint.
-    """
-    if not path.is_file():
-        raise ValueError(f"the model must be an MJCF file, got {path}, which is no file")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise ValueError(
-            f"the model {path} must be an MJCF file that MuJoCo can read: {_in_one_line(error)}"
-        ) from error
-    _leave_only_the_robot(spec, path)
-    for index, geom in enumerate(spec.geoms):
-        geom.name = geom.name or f"creps_jax_geom_{index}"
-    return spec
-
-
-def _leave_only_the_robot(spec: mujoco.MjSpec, path: Path) -> None:
-    """Delete the bodies without a free joint, poses, and sensors."""
-    bodies = spec.worldbody.bodies
-    is_free = [any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints) for body in bodies]
-    if sum(is_free) != 1:
-        found = [body.name for body, free in zip(bodies, is_free, strict=True) if free]
-        raise ValueError(
-            f"the model {path} must have one body with a free joint, the trunk of the robot, got "
-            f"{', '.join(found) or 'none'}"
-        )
-    others = [body for body, free in zip(bodies, is_free, strict=True) if not free]
-    _delete(spec, others, spec.keys, spec.sensors)
 
 
 def without_meshes(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjSpec, mujoco.MjModel]:
@@ -69,9 +36,7 @@ def without_meshes(spec: mujoco.MjSpec, path: Path) -> tuple[mujoco.MjSpec, mujo
     try:
         return spec, spec.compile()
     except ValueError as error:
-        raise ValueError(
-            f"the model {path} must compile without its meshes: {_in_one_line(error)}"
-        ) from error
+        raise ValueError(f"the model {path} must compile without its meshes: {in_one_line(error)}") from error
 
 
 def walking_model(
@@ -124,31 +89,33 @@ def _drawn(spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: tuple[float,
 
 
 def _set_up(spec: mujoco.MjSpec, servos: Mapping[str, Servo], gains: tuple[float, float]) -> None:
-    """Delete the geoms of the world, give the robot servos, and set the solver."""
-    for geom in [geom for geom in spec.geoms if geom.parent.name == "world"]:
-        spec.delete(geom)
-    _delete(spec, spec.pairs, spec.actuators)
+    """Delete the geoms of the world, give the robot servos, and set all options."""
+    delete(spec, [geom for geom in spec.geoms if geom.parent.name == "world"], spec.pairs, spec.actuators)
     for joint in spec.joints:
         if joint.name in servos:
             joint.actfrclimited = False
     stiffness, damping = gains
+    # The defaults and options of the file do not apply: a gear, disabled groups of actuators, a medium.
+    plain = mujoco.MjSpec()
     for name, servo in servos.items():
-        actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        actuator = spec.add_actuator(plain.default, name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         actuator.set_to_position(kp=stiffness, kv=damping)
         actuator.ctrllimited, actuator.ctrlrange = True, (servo.low, servo.high)
         actuator.forcelimited, actuator.forcerange = True, (-servo.torque, servo.torque)
+    spec.option = plain.option
     option = spec.option
     option.timestep, option.integrator = TIMESTEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver, option.cone = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtCone.mjCONE_PYRAMIDAL
     option.iterations, option.ls_iterations = _ITERATIONS, _LINE_ITERATIONS
-    option.gravity, option.wind = (0.0, 0.0, -GRAVITY), (0.0, 0.0, 0.0)
+    option.gravity = 0.0, 0.0, -GRAVITY
     # The set-points stay within the limits, and the servos hold the joints near the set-points.
     option.disableflags = int(mujoco.mjtDisableBit.mjDSBL_LIMIT)
-    option.enableflags = 0
 
 
 def _add_floor(spec: mujoco.MjSpec) -> None:
     """Add a level floor with tiles, and light."""
+    # Defaults of the file do not apply to the floor.
+    plain = mujoco.MjSpec()
     texture = spec.add_texture(
         name="creps_jax_tiles",
         type=mujoco.mjtTexture.mjTEXTURE_2D,
@@ -158,9 +125,10 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         width=64,
         height=64,
     )
-    floor = spec.add_material(name="creps_jax_floor", texrepeat=(1.0, 1.0), texuniform=True)
+    floor = spec.add_material(plain.default, name="creps_jax_floor", texrepeat=(1.0, 1.0), texuniform=True)
     floor.textures[int(mujoco.mjtTextureRole.mjTEXROLE_RGB)] = texture.name
     spec.worldbody.add_geom(
+        plain.default,
         name="creps_jax_floor",
         type=_PLANE,
         size=(0.0, 0.0, 0.05),
@@ -171,6 +139,7 @@ def _add_floor(spec: mujoco.MjSpec) -> None:
         material=floor.name,
     )
     spec.worldbody.add_light(
+        plain.default,
         pos=(0.0, 0.0, 3.0),
         dir=(0.3, 0.4, -1.0),
         diffuse=(0.55, 0.55, 0.55),
@@ -203,7 +172,7 @@ def _keep_masses(spec: mujoco.MjSpec) -> None:
         if heavy:
             raise ValueError(
                 f"the mass of the body {heavy[0]!r} must be stated in the model, or follow from meshes whose "
-                f"files are there: {_in_one_line(error)}"
+                f"files are there: {in_one_line(error)}"
             ) from error
         return
     for index, body in enumerate(spec.bodies):
@@ -217,25 +186,24 @@ def _keep_masses(spec: mujoco.MjSpec) -> None:
         )
         body.inertia = full.body_inertia[index]
         body.fullinertia = np.full(6, np.nan)
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
 
 
 def _gives_mass(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> bool:
     """Return whether the mass of a body depends on a geom."""
     low, high = spec.compiler.inertiagrouprange
-    is_counted = not geom.parent.explicitinertial and low <= geom.group <= high
+    from_geoms = mujoco.mjtInertiaFromGeom(spec.compiler.inertiafromgeom)
+    is_derived = from_geoms == _ALWAYS or (from_geoms != _NEVER and not geom.parent.explicitinertial)
+    is_counted = is_derived and low <= geom.group <= high
     return is_counted and (geom.density if np.isnan(geom.mass) else geom.mass) > 0.0
 
 
 def _delete_meshes(spec: mujoco.MjSpec) -> None:
-    for geom in [geom for geom in spec.geoms if geom.type == _MESH]:
-        spec.delete(geom)
-    _delete(spec, spec.meshes)
-
-
-def _delete(spec: mujoco.MjSpec, *lists: Sequence[object]) -> None:
-    for elements in lists:
-        for element in list(elements):
-            spec.delete(element)
+    """Delete the meshes, the geoms that have one, and their explicit contacts."""
+    geoms = [geom for geom in spec.geoms if geom.type == _MESH]
+    names = {geom.name for geom in geoms}
+    pairs = [pair for pair in spec.pairs if names & {pair.geomname1, pair.geomname2}]
+    delete(spec, pairs, geoms, spec.meshes)
 
 
 def _pair_frictions(spec: mujoco.MjSpec) -> dict[str, Sequence[float]]:
@@ -247,9 +215,3 @@ def _pair_frictions(spec: mujoco.MjSpec) -> dict[str, Sequence[float]]:
             if other in ground:
                 found[name] = (pair.friction[0], pair.friction[2], pair.friction[3])
     return found
-
-
-def _in_one_line(error: Exception) -> str:
-    """Return the message of MuJoCo, which names the element in further lines."""
-    text = " ".join(str(error).removeprefix("Error: ").split())
-    return text if len(text) <= _WIDTH else f"{text[: _WIDTH - 4]} ..."
