@@ -78,8 +78,10 @@ def _range_of(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> tuple
     for each in actuators:
         is_servo = model.actuator_biastype[each] == mujoco.mjtBias.mjBIAS_AFFINE
         is_servo &= model.actuator_biasprm[each, 1] == -model.actuator_gainprm[each, 0] != 0
-        if is_servo and model.actuator_ctrllimited[each]:
-            ranges.append(model.actuator_ctrlrange[each])
+        gear = model.actuator_gear[each, 0]
+        if is_servo and model.actuator_ctrllimited[each] and gear != 0.0:
+            # The set-point of a servo is the angle times the gear.
+            ranges.append(np.sort(model.actuator_ctrlrange[each] / gear))
     low = max((float(low) for low, _ in ranges), default=-np.pi)
     high = min((float(high) for _, high in ranges), default=np.pi)
     return low, high

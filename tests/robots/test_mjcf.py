@@ -169,6 +169,29 @@ def test_joints_without_limits_turn_once_or_as_their_servos(tmp_path):
     assert (robot.joint_lower[1], robot.joint_upper[1]) == (-0.9, 1.0)
 
 
+@pytest.mark.parametrize("gear", [2.0, 0.5, -3.0])
+def test_the_range_of_a_geared_servo_is_that_of_its_joint(gear, tmp_path):
+    low, high = sorted((-0.9 * gear, 1.1 * gear))
+    head = ('"head" axis="0 0 1" range="-1 1"', '"head" axis="0 0 1"')
+    servo = f'<position name="head" joint="head" kp="50" gear="{gear}" forcerange="-7 6" '
+    servo += f'ctrlrange="{low} {high}"/>'
+    robot = read(tmp_path, head, (MOTOR.format(name="head"), servo))
+    assert (robot.joint_lower[1], robot.joint_upper[1]) == pytest.approx((-0.9, 1.1))
+    # The set-points are those of MuJoCo: the file's own servo moves the joint to its limits.
+    own = mujoco.MjModel.from_xml_path(str(tmp_path / "small.xml"))
+    data = mujoco.MjData(own)
+    for angle, point in ((-0.9, low if gear > 0 else high), (1.1, high if gear > 0 else low)):
+        data.joint("head").qpos[0], data.actuator("head").ctrl[0] = angle, point
+        mujoco.mj_forward(own, data)
+        assert data.actuator("head").force[0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_servo_without_gear_has_no_range(tmp_path):
+    idle = '<position name="idle" joint="head" gear="0" ctrlrange="-0.1 0.1"/>'
+    robot = read(tmp_path, ("<actuator>", f"<actuator>{idle}"))
+    assert (robot.joint_lower[1], robot.joint_upper[1]) == (-1.0, 1.0)
+
+
 def test_what_is_given_is_taken(path):
     crouch = [0.0, 0.0, -0.6, 1.2, -0.6, 0.0]
     robot = humanoid_from_mjcf(
