@@ -75,7 +75,7 @@ _OURS = {
     "archive_size": 480,
 }
 SETTINGS = {
-    preset: Settings(**{**vars(WALK_SETTINGS[preset]), **_OURS, **changes})
+    preset: Settings(**{**dataclasses.asdict(WALK_SETTINGS[preset]), **_OURS, **changes})
     for preset, changes in {"quick": {"iterations": 25}, "best": {"iterations": 60, "eval_seeds": 30}}.items()
 }
 

@@ -11,7 +11,7 @@ from creps_jax import checks
 from creps_jax.errors import UserError, suggest
 from creps_jax.robots.humanoid import Humanoid
 
-__all__ = ["humanoid_from_toml"]
+__all__ = ["humanoid_from_toml", "model_file"]
 
 
 def humanoid_from_toml(path: Path | str) -> Humanoid:
@@ -32,10 +32,7 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
 
     checks.instance("path", path, str, Path)
     path = Path(path)
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise UserError(f"the robot must be described by a TOML file, cannot read {path}: {error}") from error
+    values = _described(path)
     parameters = inspect.signature(humanoid_from_mjcf).parameters
     known = ["model", *(name for name in parameters if name != "path")]
     for key in values:
@@ -50,6 +47,22 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
         return humanoid_from_mjcf(model, **values)
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def model_file(path: Path) -> Path:
+    """Return the model file that a description names.
+
+    Raises:
+        ValueError: If the description cannot be read, or names no model.
+    """
+    return _model_path(path, _described(path).get("model"))
+
+
+def _described(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UserError(f"the robot must be described by a TOML file, cannot read {path}: {error}") from error
 
 
 def _model_path(spec: Path, model: Any) -> Path:

@@ -9,7 +9,7 @@ from creps_jax.errors import UserError, suggest
 from creps_jax.robots import robot as robots
 from creps_jax.robots.humanoid import Humanoid
 from creps_jax.robots.robot import NAO, NAO_H25, Robot
-from creps_jax.robots.spec import humanoid_from_toml
+from creps_jax.robots.spec import humanoid_from_toml, model_file
 from creps_jax.walking.params import NAO_BOUNDS, NAO_H25_BOUNDS, Bounds, humanoid_bounds
 
 __all__ = ["ROBOTS", "Bounds", "RobotRanges", "find_robot", "is_spec", "robot_id"]
@@ -57,15 +57,25 @@ def find_robot(name: str) -> RobotRanges:
             describe a robot.
     """
     if is_spec(name):
-        return _read_spec(robot_id(name))
+        path = robot_id(name)
+        return _read_spec(path, _last_changes(path))
     if name not in ROBOTS:
         raise UserError(f"unknown robot {name!r}{suggest(name, ROBOTS)}, or name a {SPEC_SUFFIX} file")
     return ROBOTS[name]
 
 
+def _last_changes(path: str) -> tuple[int, ...]:
+    """Return when a description and its model were written, ns; nothing if they cannot be found."""
+    try:
+        return tuple(file.stat().st_mtime_ns for file in (Path(path), model_file(Path(path))))
+    except (OSError, ValueError):
+        # The error is that of reading the robot.
+        return ()
+
+
 @functools.lru_cache(maxsize=16)
-def _read_spec(path: str) -> RobotRanges:
-    """Read a file once in a process."""
+def _read_spec(path: str, _: tuple[int, ...]) -> RobotRanges:
+    """Read a robot once in a process, unless its files were written again."""
     robot: Humanoid = humanoid_from_toml(path)
     if robot.name in ROBOTS:
         raise UserError(f"{path} must give its robot a name of its own, got {robot.name!r}")

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -139,7 +139,7 @@ class Settings:
         # Settings from a manifest are plain values.
         if isinstance(self.features, Mapping):
             object.__setattr__(self, "features", Features(**self.features))
-        find_robot(self.robot)
+        self.ranges()
         choices = {"constraint": RUN_CONSTRAINTS, "sampler": SAMPLERS, "physics": PHYSICS}
         if self.bounds is not None:
             choices["bounds"] = BOUNDS
@@ -163,6 +163,11 @@ class Settings:
 
     def ranges(self) -> RobotRanges:
         """Return the robot, with its range of speeds."""
+        return self._ranges
+
+    @cached_property
+    def _ranges(self) -> RobotRanges:
+        # A run keeps its robot if the files of the robot are edited meanwhile.
         return find_robot(self.robot)
 
     def box(self) -> Bounds:
