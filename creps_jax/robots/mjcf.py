@@ -74,7 +74,8 @@ def humanoid_from_mjcf(
         ValueError: If the file cannot be read, a name is not in the model, the joints of a leg are not in the
             order of the model, the legs do not mirror each other, the knee bends backwards, a foot has no
             geom or only meshes, the soles are level neither with all leg angles zero nor in the crouch, a
-            joint has no actuator or no torque limit, or an argument has another type or is out of its range.
+            joint has no actuator or no torque limit, a leg's range seems to be in degrees, or an argument has
+            another type or is out of its range.
     """
     source = {key: value for key, value in locals().items() if value is not None and key != "path"}
     checks.instance("path", path, str, Path)
@@ -101,6 +102,7 @@ def humanoid_from_mjcf(
     swing = mjcf_settings.by_joint("arm_swing", arm_swing, mjcf_settings.OTHERS, others)
     max_speeds = mjcf_settings.checked_max_speeds(max_speed, names)
     chains, soles, crouches = _read_chains(model, legs, servos, held, crouch)
+    mjcf_settings.check_size(mjcf_legs.leg_length(chains[0], legs[0]), foot_spacing, speeds)
     posture = mjcf_posture.standing_posture(chains, legs, soles, names, held, crouches)
     mjcf_posture.check_kinematics(model, chains, legs, soles, held)
     return _assembled(

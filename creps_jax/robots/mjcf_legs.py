@@ -18,6 +18,7 @@ __all__: list[str] = []
 FIRST_BEND, _LEAST_BEND = 0.6, 0.03
 # An axis is along y if its y component is larger than this.
 _ALONG = 0.8
+_TURN = 2.0 * np.pi
 _MIRROR_TOLERANCE = 0.02
 # Weight, in the inverse kinematics, of the rotation that a leg of five joints cannot make.
 _MISSING_WEIGHT = 0.03
@@ -99,7 +100,7 @@ def read_chain(zero: mujoco.MjData, leg: Leg, servos: Mapping[str, Servo]) -> Le
     The sole is unknown: it is set when it is known in which pose the soles are level.
 
     Raises:
-        ValueError: If not three of the axes are along y.
+        ValueError: If not three of the axes are along y, or a range seems to be in the wrong unit.
     """
     ids = list(leg.ids)
     axes, points = zero.xaxis[ids].copy(), zero.xanchor[ids].copy()
@@ -112,7 +113,24 @@ def read_chain(zero: mujoco.MjData, leg: Leg, servos: Mapping[str, Servo]) -> Le
             1.0 if is_free else _MISSING_WEIGHT for is_free in (num_roll > 1, num_yaw > 0)
         )
     limits = np.array([(servos[name].low, servos[name].high) for name in leg.joints])
+    _check_unit(limits, leg)
     return LegChain(axes, points, np.eye(4), limits[:, 0], limits[:, 1], weights)
+
+
+def _check_unit(limits: Float[np.ndarray, "k 2"], leg: Leg) -> None:
+    """Check that the ranges of a leg are neither degrees that were read as radians, nor the reverse."""
+    widest = int(np.argmax(np.ptp(limits, axis=1)))
+    low, high = limits[widest]
+    if np.abs(limits).max() > _TURN:
+        wrong, right = "must be within a turn, -6.28 to 6.28 rad", "degree"
+    elif high - low < np.radians(_TURN):
+        wrong, right = f"must be wider than {np.radians(_TURN):.2f} rad", "radian"
+    else:
+        return
+    raise ValueError(
+        f"the range of {leg.joints[widest]!r} {wrong}, got {low:.4g} to {high:.4g} rad: if the model states "
+        f'{right}s, its compiler must have angle="{right}"'
+    )
 
 
 def pitch_joints(axes: Float[np.ndarray, "k 3"], leg: Leg) -> tuple[int, int, int]:

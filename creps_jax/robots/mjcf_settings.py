@@ -8,6 +8,7 @@ import numpy as np
 from creps_jax import checks
 from creps_jax.errors import suggest
 from creps_jax.robots.mjcf_servos import Servo
+from creps_jax.robots.robot import GRAVITY
 
 # Only `humanoid_from_mjcf` is public.
 __all__: list[str] = []
@@ -85,6 +86,24 @@ def checked_max_speeds(max_speed: Any, names: Sequence[str]) -> tuple[float, ...
         return tuple(given.get(joint, _MAX_SPEED) for joint in names)
     fastest = _MAX_SPEED if max_speed is None else checks.number("max_speed", max_speed, above=0.0)
     return (float(fastest),) * len(names)
+
+
+def check_size(leg: float, foot_spacing: float | int | None, speeds: tuple[float, float] | None) -> None:
+    """Check distance of the feet and speeds against the length of the leg, m.
+
+    Raises:
+        ValueError: If the feet are farther apart than the leg is long, or the Froude number is above 1.
+    """
+    if foot_spacing is not None and not foot_spacing < leg:
+        raise ValueError(
+            f"foot_spacing must be below the length of the leg, {leg:.3f} m, got {checks.shown(foot_spacing)}"
+        )
+    fastest = np.sqrt(GRAVITY * leg)
+    if speeds is not None and not speeds[1] <= fastest:
+        raise ValueError(
+            f"speeds must be at most {fastest:.2f} m/s, the fastest walk of a leg of {leg:.3f} m (Froude "
+            f"number 1), got {speeds[1]:g}"
+        )
 
 
 def check_number(argument: str, value: Any, **limits: float) -> None:

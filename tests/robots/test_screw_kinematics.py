@@ -22,6 +22,17 @@ NUM_UPPER = NAO.left_leg[0]
 """Number of a NAO's joints above its legs, the first ones."""
 
 
+@pytest.mark.parametrize("dtype", [np.int32, bool, np.float16])
+def test_poses_and_angles_of_any_numbers_are_solved_in_float32(robot, dtype):
+    pose, guess = np.eye(4, dtype=dtype), np.zeros(6, dtype)
+    expected = chain_ik(np.eye(4, dtype=np.float32), np.zeros(6, np.float32), robot.left)
+    solve = jax.jit(lambda pose, guess: chain_ik(pose, guess, robot.left))
+    for angles in (chain_ik(pose, guess, robot.left), solve(jnp.asarray(pose), jnp.asarray(guess))):
+        assert angles.dtype == jnp.float32
+        np.testing.assert_allclose(angles, expected, atol=1e-6)
+    assert chain_fk(guess, robot.left).dtype == jnp.float32
+
+
 def spec_of(parts):
     return SPEC | {f"{side}_leg": [f"{side}_{part}" for part in parts] for side in SIDES}
 

@@ -151,6 +151,25 @@ MODELS = {
         "ankles at y = "
         "0.070 and 0.290 m$",
     ),
+    "degrees for radians": (
+        both_knees(0, 126),
+        "the range of 'left_knee' must be within a turn, -6.28 to 6.28 rad, got 0 to 126 rad: if the model "
+        'states degrees, its compiler must have angle="degree"$',
+    ),
+    "degrees of one joint": (
+        [
+            (
+                '"right_ankle_roll" axis="-1 0 0" range="-0.6 0.6"',
+                '"right_ankle_roll" axis="-1 0 0" range="-20 20"',
+            )
+        ],
+        "the range of 'right_ankle_roll' must be within a turn, .* got -20 to 20 rad: if the model",
+    ),
+    "radians for degrees": (
+        [('angle="radian"', 'angle="degree"')],
+        "the range of 'left_hip_pitch' must be wider than 0.11 rad, got -0.02793 to 0.01745 rad: if the "
+        'model states radians, its compiler must have angle="radian"$',
+    ),
     "no XML": ([("<worldbody>", "<worldbody")], "small.xml must be an MJCF file that MuJoCo can read: "),
     "no MJCF": ([("<freejoint", "<freejoin")], "small.xml must be an MJCF file that MuJoCo can read: "),
     "mass of a missing mesh": (
@@ -299,6 +318,16 @@ ARGUMENTS = {
     "max_torque a": ({"max_torque": "a"}, "max_torque must be a number, got 'a'$"),
     "foot_spacing 0": ({"foot_spacing": 0.0}, "foot_spacing must be finite and above 0, got 0.0$"),
     "foot_spacing a": ({"foot_spacing": "a"}, "foot_spacing must be a number, got 'a'$"),
+    "feet far apart": (
+        {"foot_spacing": 12},
+        "foot_spacing must be below the length of the leg, 0.401 m, got 12$",
+    ),
+    "feet a leg apart": ({"foot_spacing": 0.41}, "foot_spacing must be below the length of the leg"),
+    "speeds of a car": (
+        {"speeds": [5, 30]},
+        r"speeds must be at most 1.98 m/s, the fastest walk of a leg of 0.401 m \(Froude number 1\), got 30$",
+    ),
+    "one speed too high": ({"speeds": (0.1, 2.0)}, "speeds must be at most 1.98 m/s, .* got 2$"),
     "speeds out of order": (
         {"speeds": (0.5, 0.1)},
         r"speeds must be two numbers, the lower first, got \(0.5, 0.1\)$",
