@@ -38,6 +38,11 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", (ROOT / page).read_text(), re.DOTALL | re.MULTILINE)
 
 
+def test_the_description_of_a_humanoid_is_that_of_the_checkout():
+    description = (ROOT / "models" / "humanoids" / "k1.toml").read_text()
+    assert blocks("docs/humanoids.md", "toml") == [description]
+
+
 WITH_PYTHON = [page for page in PAGES if blocks(page, "python")]
 NOT_INSTALLED = ("tensorboardX", "wandb")
 """Packages that pages use and the tests do not need: without them, their blocks are skipped."""
