@@ -36,6 +36,8 @@ def run(settings: Settings, key: jax.Array, session: Session = Session()) -> dic
     if is_spec(settings.robot) and session.console is not None:
         session.console.print(robot_check.summary(robot_check.try_standard_gaits(settings.ranges())))
     states, log = learning.learn_to_walk(settings, learn_key, session=session, name="walk")
+    if session.console is not None:
+        session.console.print(f"evaluating the policy at {len(settings.speeds())} speeds")
     policy, choice = _keep_best(settings, jax.random.fold_in(key, 1), states.policy, log["coef"])
     speeds, outcome = learning.walk_at_all_speeds(settings, evaluate_key, policy)
     fine = settings.speeds(51)
@@ -153,6 +155,7 @@ def finish(settings: Settings, arrays: Arrays, folder: Path, say: Callable[[str]
     files.save_text(folder / "table.csv", tables.to_csv(table(arrays)))
     policy = save_policy(settings, arrays, folder, say)
     robot = settings.ranges().robot
+    say("writing the video of walks at several speeds")
     clips = record(policy, filmed_speeds(policy), seed=0, robot=robot, duration=settings.duration)
     save_film(clips, folder / "walk.mp4", say, robot=robot)
 

@@ -60,7 +60,8 @@ class Robot:
         max_joint_torque: Largest torque of each joint, N m.
         left_leg: Index of each joint of the left leg, from hip to ankle, in a joint vector.
         right_leg: Those of the right leg.
-        posture: Angles with which the robot stands, rad: the legs bent, the other joints as they are held.
+        posture: Angles with the knees bent and the feet below the hips, whatever `foot_spacing` is, rad; the
+            other joints as they are held.
         arm_swing: Change of each angle for each metre that the left foot is ahead of the right one, rad/m.
         hip_centre: Position (x, z) of the middle of the hips.
         leg_length: Distance from hip to ankle of a straight leg.

@@ -1,6 +1,8 @@
 """Record, show and film walks of a policy."""
 
 import math
+import os.path
+import shlex
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -179,10 +181,10 @@ def shipped_policy(robot: str | None = None) -> Path:
     find_robot(robot)
     shipped = policies_folder(robot) / "walk.npz"
     if is_spec(robot) or not shipped.exists():
-        asked = "" if robot == NAO.name else f" --robot {robot}"
-        raise UserError(
-            f"no policy has been learned yet: python -m experiments run walk{asked} --preset quick"
-        )
+        asked = "" if robot == NAO.name else f" --robot {shlex.quote(robot)}"
+        # The command chooses the preset of a robot that a file describes.
+        preset = "" if is_spec(robot) else " --preset quick"
+        raise UserError(f"no policy has been learned yet: python -m experiments run walk{asked}{preset}")
     return shipped
 
 
@@ -229,7 +231,7 @@ def robot_of(policy: Learned, robot: str | None = None) -> Robot:
     """
     name, spec = str(policy.task.get("robot", NAO.name)), str(policy.task.get("spec", ""))
     if robot is None:
-        if name not in ROBOTS and not (is_spec(spec) and Path(spec).is_file()):
+        if name not in ROBOTS and not (is_spec(spec) and os.path.isfile(spec)):
             where = f"described by {spec}, which is not there" if spec else f"not of {', '.join(ROBOTS)}"
             raise UserError(
                 f"the policy is of the robot {name!r}, {where}: name the file that describes it with --robot"

@@ -85,7 +85,7 @@ def described(robot: Robot) -> list[str]:
     if isinstance(robot, Humanoid):
         for side, joints in (("left", robot.left_leg), ("right", robot.right_leg)):
             angles = ", ".join(f"{robot.joint_names[i]} {robot.posture[i]:.2f}" for i in joints)
-            lines.append(f"  {side} leg when standing (rad): {angles}")
+            lines.append(f"  {side} leg with its foot below the hip and its knee bent (rad): {angles}")
         torques = ", ".join(f"{robot.max_joint_torque[i]:g}" for i in robot.left_leg)
         lines.append(f"  torques of the leg (N m): {torques}")
     return lines

@@ -1,6 +1,9 @@
 """A robot that a file describes, from the first command to the last: check, learn, play, drive, export."""
 
+import contextlib
 import dataclasses
+import io
+import shlex
 import shutil
 
 import numpy as np
@@ -8,11 +11,13 @@ import pytest
 
 from creps_jax.errors import UserError
 from creps_jax.policies.learned import load
+from creps_jax.robots.screw_kinematics import chain_fk
 from creps_jax.tools import play, robot_check
 from creps_jax.tools.cli import main as tools
 from creps_jax.tools.robot_check import Trial, summary
 from creps_jax.tools.robots import find_robot, robot_id
 from creps_jax.walking.params import HUMANOID_BOUNDS, humanoid_bounds
+from experiments import runner
 from experiments.cli import main
 from experiments.walk import SETTINGS
 from tests.tools.offset_humanoid import write_spec
@@ -32,8 +37,17 @@ def learned(spec, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder.parent)
         patch.setattr(play, "write_video", lambda path, model, clips, **_: path.write_bytes(b"film"))
-        assert main(["run", "walk", "--robot", str(spec), "--out", str(folder), *TINY.split()]) == 0
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            assert main(["run", "walk", "--robot", str(spec), "--out", str(folder), *TINY.split()]) == 0
+        (folder.parent / "printed.txt").write_text(printed.getvalue())
     return folder
+
+
+def test_a_run_prints_what_it_does_after_learning(learned):
+    lines = (learned.parent / "printed.txt").read_text().splitlines()
+    starts = ("evaluating the policy at 11 speeds", "figure: ", "policy: ", "writing the video", "video: ")
+    found = [next(i for i, line in enumerate(lines) if line.startswith(start)) for start in starts]
+    assert found == sorted(found)
 
 
 def test_a_robot_is_described_and_tried_before_it_learns(spec, capsys):
@@ -42,6 +56,35 @@ def test_a_robot_is_described_and_tried_before_it_learns(spec, capsys):
     robot = find_robot(str(spec)).robot
     assert out.startswith(f"{robot.name}: ") and "of 18 standard gaits stay up" in out.splitlines()[-1]
     assert robot.joint_names[robot.left_leg[0]] in out
+
+
+def test_the_feet_of_the_printed_angles_are_below_the_hips(spec):
+    robot = find_robot(str(spec)).robot
+    for side, leg, chain in (("left", robot.left_leg, robot.left), ("right", robot.right_leg, robot.right)):
+        (line,) = (line for line in robot_check.described(robot) if line.startswith(f"  {side} leg"))
+        assert line.startswith(f"  {side} leg with its foot below the hip and its knee bent (rad): ")
+        for index in leg:
+            assert f"{robot.joint_names[index]} {robot.posture[index]:.2f}" in line
+        sole = chain_fk(np.array([robot.posture[index] for index in leg], np.float32), chain)
+        assert float(sole[0, 3]) == pytest.approx(robot.hip_centre[0], abs=1e-3)
+
+
+def test_a_robot_without_a_policy_is_told_the_command_that_learns_one(spec, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "a folder" / "small.toml"
+    shutil.copytree(spec.parent, path.parent)
+    shutil.move(path.parent / spec.name, path)
+    with pytest.raises(UserError, match="no policy has been learned yet: ") as caught:
+        play.default_policy(str(path))
+    command = str(caught.value).partition(": ")[2]
+    assert "--preset" not in command
+    program, _, module, *arguments = shlex.split(command)
+    assert (program, module, arguments) == ("python", "experiments", ["run", "walk", "--robot", str(path)])
+    # Its preset is that of a robot from a file.
+    asked = []
+    monkeypatch.setattr(runner, "run", lambda request, **_: asked.append(request))
+    assert main(arguments) == 0
+    assert asked[0].preset == "humanoid"
 
 
 def test_no_gait_that_stays_up_is_an_advice():
