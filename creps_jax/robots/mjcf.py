@@ -62,13 +62,16 @@ def humanoid_from_mjcf(
         arm_swing: Change of a joint's angle for each metre that the left foot is ahead of the right one, by
             name, rad/m; none by default.
         kp: Stiffness of the servos, N m/rad; by default ten times weight times leg.
-        kv: Damping of the servos, N m s/rad; by default from `kp` and the length of the leg.
+        kv: Damping of the servos, N m s/rad; by default `kp` times 0.01 s, times the square root of the leg's
+            length relative to that of the NAO.
         max_speed: Largest speed of all joints, or of each by name, rad/s; 8 by default.
         max_torque: Torque of the motors for which the model states no limit, N m.
-        foot_spacing: Distance between the ankles when standing and walking, m. By default the soles are
-            close to each other, but not farther apart than the hips: the narrower the stance, the less
-            torque the hips need to carry the robot on one foot.
-        speeds: Lowest and highest speed at which it is to walk, m/s; by default those of a NAO, scaled.
+        foot_spacing: Distance between the ankles when standing and walking, m; less than the length of the
+            leg. By default the soles of legs of six joints are close to each other, but not farther apart
+            than the hips: the narrower the stance, the less torque the hips need to carry the robot on one
+            foot. Feet of legs of five joints are below the hips.
+        speeds: Lowest and highest speed at which it is to walk, m/s; by default those of a NAO, scaled. The
+            Froude number, speed^2 / (g leg), is at most 1.
 
     Raises:
         ValueError: If the file cannot be read, a name is not in the model, the joints of a leg are not in the

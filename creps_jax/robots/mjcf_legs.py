@@ -66,8 +66,8 @@ def read_leg(model: mujoco.MjModel, side: str, joints: Sequence[str], foot: str)
     ]
     if skipped:
         raise ValueError(
-            f"{side}_leg must list all joints from hip to foot, got none of {', '.join(skipped)}, which "
-            f"the model has between {joints[0]} and {foot}"
+            f"{side}_leg must list all joints from hip to foot; missing: {', '.join(skipped)}, which the "
+            f"model has between {joints[0]} and {foot}"
         )
     return Leg(tuple(joints), foot, ids)
 
@@ -169,9 +169,9 @@ def check_mirrored(chains: Sequence[LegChain], legs: Sequence[Leg]) -> None:
             "left_leg must be on the left side, where y is positive, and right_leg on the right, got "
             f"ankles at y = {left.points[-1, 1]:.3f} and {right.points[-1, 1]:.3f} m"
         )
-    mirror = np.array([1.0, -1.0, 1.0])
+    mirror, axes = np.array([1.0, -1.0, 1.0]), mirrored_axes(left)
     for i, (first, second) in enumerate(zip(legs[0].joints, legs[1].joints, strict=True)):
-        axis = -mirror * left.axes[i]
+        axis = axes[i]
         apart = mirror * left.points[i] - right.points[i]
         # A point may be anywhere on its axis.
         apart = apart - (apart @ axis) * axis
@@ -180,6 +180,11 @@ def check_mirrored(chains: Sequence[LegChain], legs: Sequence[Leg]) -> None:
                 f"right_leg must mirror left_leg joint by joint, got {first!r} and {second!r}, whose axes "
                 "do not mirror each other"
             )
+
+
+def mirrored_axes(chain: LegChain) -> Float[np.ndarray, "k 3"]:
+    """Return the axes of a leg, mirrored to the other side: a mirror reverses turns about x and z."""
+    return chain.axes * np.array([-1.0, 1.0, -1.0])
 
 
 def with_knee_ahead(chain: LegChain, leg: Leg) -> LegChain:

@@ -10,7 +10,15 @@ import numpy as np
 
 from creps_jax import checks
 from creps_jax.robots.humanoid import LegChain
-from creps_jax.robots.mjcf_legs import FIRST_BEND, Leg, foot_pose, leg_length, pitch_joints, posed
+from creps_jax.robots.mjcf_legs import (
+    FIRST_BEND,
+    Leg,
+    foot_pose,
+    leg_length,
+    mirrored_axes,
+    pitch_joints,
+    posed,
+)
 from creps_jax.robots.mjcf_settings import ROUNDING
 from creps_jax.robots.mjcf_soles import Sole
 from creps_jax.robots.screw_kinematics import chain_fk, chain_ik
@@ -53,8 +61,7 @@ def crouches_of_both(crouch: Any, chains: Sequence[LegChain], legs: Sequence[Leg
     """
     left = _checked_crouch(crouch, chains[0], legs[0])
     # The right leg's angles have the sign of its axes relative to the mirrored ones.
-    mirrored = chains[0].axes * np.array([-1.0, 1.0, -1.0])
-    return [left, np.sign(np.sum(mirrored * chains[1].axes, axis=1)) * left]
+    return [left, np.sign(np.sum(mirrored_axes(chains[0]) * chains[1].axes, axis=1)) * left]
 
 
 def _checked_crouch(crouch: Any, chain: LegChain, leg: Leg) -> np.ndarray:

@@ -48,7 +48,8 @@ def read_servos_of(model: mujoco.MjModel, max_torque: float | int | None) -> dic
             if max_torque is None:
                 raise ValueError(
                     f"the torque of {name!r} must have a limit: its joint has no actuatorfrcrange, and its "
-                    "actuator no forcerange; name one in the model, or max_torque in the spec"
+                    "actuator has neither a forcerange nor, as a motor, a ctrlrange; state one in the model, "
+                    "or max_torque in the description"
                 )
             torque = float(max_torque)
         if torque <= 0.0:

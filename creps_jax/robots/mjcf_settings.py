@@ -1,5 +1,6 @@
 """Check the arguments with which a humanoid is read from its model."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -49,9 +50,23 @@ def named(argument: str, kind: str, name: str, known: Sequence[str]) -> str:
         ValueError: With the nearest name, if it is not.
     """
     if name not in known:
-        near = suggest(str(name), known)
+        if not known:
+            raise ValueError(
+                f"{argument} must name {kind} of the model, which has none, got {checks.shown(name)}"
+            )
+        side = _side_of(str(name)) or _side_of(argument)
+        near = suggest(str(name), known, [each for each in known if _side_of(each) == side])
         raise ValueError(f"{argument} must name {kind} of the model, got {checks.shown(name)}{near}")
     return name
+
+
+def _side_of(name: str) -> str | None:
+    """Return the side that a name tells, by a word or by a letter that is a word."""
+    for side in ("left", "right"):
+        letter = side[0] + side[0].upper()
+        if side in name.lower() or re.search(rf"(?:^|[^A-Za-z])[{letter}](?:$|[^a-z])", name):
+            return side
+    return None
 
 
 def by_joint(

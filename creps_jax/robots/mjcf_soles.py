@@ -84,6 +84,9 @@ def level_pose(
     tilted = _tilted(model, data, legs)
     if tilted is not None:
         _, spanned, size = _touching(model, data, tilted)
+        if size[0] == 0.0:
+            found = "a single point of contact" if size[1] == 0.0 else "a row of points from left to right"
+            raise ValueError(f"the sole of {tilted.foot!r} must have a length, got {found}")
         raise ValueError(
             f"the sole of {tilted.foot!r} must be level with all joints of the leg at zero, or else at the "
             f"angles of crouch, got lowest points at {where} that span {spanned[0]:.3f} of its {size[0]:.3f} "

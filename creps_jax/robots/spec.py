@@ -40,7 +40,7 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
             raise UserError(f"{path} has an unknown key {key!r}{suggest(key, known)}")
     required = ["model", *(n for n, p in parameters.items() if p.default is p.empty and n != "path")]
     if missing := [key for key in required if key not in values]:
-        raise UserError(f"{path} must have the keys {', '.join(required)}, got none of {', '.join(missing)}")
+        raise UserError(f"{path} must have the keys {', '.join(required)}; missing: {', '.join(missing)}")
     model = _model_path(path, values.pop("model"))
     values.setdefault("name", path.stem)
     try:
@@ -61,7 +61,7 @@ def model_file(path: Path) -> Path:
 def _described(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise UserError(f"the robot must be described by a TOML file, cannot read {path}: {error}") from error
 
 
@@ -80,5 +80,6 @@ def _model_path(spec: Path, model: Any) -> Path:
     if not folders:
         raise UserError(
             f"model in {spec} must be in an installed package, got {model!r}: there is no package {package!r}"
+            "; install it, or name the path of the file (a file in a subpackage is package:folder/file)"
         )
     return Path(next(iter(folders))) / inside

@@ -6,7 +6,7 @@ import re
 import pytest
 
 from creps_jax.errors import UserError
-from creps_jax.robots import mjcf, spec
+from creps_jax.robots import mjcf, mjcf_settings, spec
 from tests.robots.small_humanoid import FEET, MOTOR, SPEC, write_model
 
 LEFT, RIGHT = SPEC["left_leg"], SPEC["right_leg"]
@@ -69,8 +69,9 @@ MODELS = {
     ),
     "no torque limit": (
         [(KNEE_MOTOR, NO_LIMIT.format(name="left_knee"))],
-        "the torque of 'left_knee' must have a limit: its joint has no actuatorfrcrange, and its actuator no "
-        "forcerange; name one in the model, or max_torque in the spec$",
+        "the torque of 'left_knee' must have a limit: its joint has no actuatorfrcrange, and its actuator "
+        "has neither a forcerange nor, as a motor, a ctrlrange; state one in the model, or max_torque in the "
+        "description$",
     ),
     "torque in one direction": (
         [(KNEE_MOTOR, KNEE_MOTOR.replace('"-8 8"', '"0 8"'))],
@@ -138,7 +139,21 @@ MODELS = {
     ),
     "feet that are points": (
         [('type="box" pos="0.03 0.005 -0.03" size="0.09 0.045 0.01"', 'type="sphere" size="0.05"')],
-        "the sole of 'left_foot' must be level .* span 0.000 of its 0.000 m",
+        "the sole of 'left_foot' must have a length, got a single point of contact$",
+    ),
+    "feet that are rows of points": (
+        [
+            (
+                sole,
+                "".join(
+                    f'<geom type="sphere" pos="0 {y} -0.03" size="0.01" mass="0.1"/>' for y in (-0.03, 0.03)
+                ),
+            )
+            for sole in (
+                FEET["box"].format(side=side, y=y) for side, y in (("left", 0.005), ("right", -0.005))
+            )
+        ],
+        "the sole of 'left_foot' must have a length, got a row of points from left to right$",
     ),
     "legs in one line": (
         [
@@ -191,6 +206,10 @@ ARGUMENTS = {
     "unknown joint": (
         {"left_leg": ["left_hip_yow", *LEFT[1:]]},
         "left_leg must name joints of the model, got 'left_hip_yow', did you mean 'left_hip_yaw'",
+    ),
+    "a name without its side": (
+        {"right_leg": ["hip_yaw", *RIGHT[1:]]},
+        "right_leg must name joints of the model, got 'hip_yaw', did you mean 'right_hip_yaw'",
     ),
     "unknown body": (
         {"feet": ["left_foot", "right_sole"]},
@@ -247,8 +266,7 @@ ARGUMENTS = {
     "an arm for a leg": ({"left_leg": ["left_shoulder", *LEFT[1:]]}, "left_leg must list"),
     "joint skipped": (
         {"left_leg": [*LEFT[:1], *LEFT[2:]]},
-        "left_leg must list all joints from hip to foot, got none of left_hip_roll, which the model "
-        "has between "
+        "left_leg must list all joints from hip to foot; missing: left_hip_roll, which the model has between "
         "left_hip_yaw and left_foot$",
     ),
     "first joint skipped": (
@@ -257,7 +275,7 @@ ARGUMENTS = {
     ),
     "last joint skipped": (
         {"left_leg": LEFT[:-1], "right_leg": RIGHT[:-1]},
-        "left_leg must list all joints from hip to foot, got none of left_ankle_roll",
+        "left_leg must list all joints from hip to foot; missing: left_ankle_roll",
     ),
     "joint twice": ({"left_leg": [*LEFT[:5], LEFT[4]]}, "left_leg must have each name once, got"),
     "four joints": (
@@ -387,6 +405,34 @@ def test_feet_that_are_tilted_in_the_crouch_too_are_named(tmp_path):
     assert re.search("crouch must have 'left_knee'", error_of(path, crouch=[0.0, 0.0, 0.4, -0.4, -0.2, 0.0]))
 
 
+NAMES = {
+    "LHipPitch": ("LHipPich", ["RHipPitch", "LHipPitch", "LHipRoll"]),
+    "l_ank_pitch": ("l_ankle_pitch", ["r_ank_pitch", "l_ank_roll", "l_ank_pitch", "r_ankle"]),
+    "hip.R": ("hips.R", ["hip.L", "hip.R"]),
+    "Left_Hip_Roll": ("Left_Hip_Rol", ["Right_Hip_Roll", "Left_Hip_Roll"]),
+    "left_knee_joint": ("left_knee_right", ["right_knee_right", "left_knee_joint"]),
+    "l_knee": ("l_knee_pitch", ["r_knee_pitch", "l_knee"]),
+    "right_hip_roll": ("left_hip_roll", ["right_hip_roll", "torso"]),
+    "waist": ("wast", ["left_hip", "waist"]),
+}
+
+
+@pytest.mark.parametrize("nearest", NAMES)
+def test_the_nearest_name_is_one_of_the_same_side(nearest):
+    name, known = NAMES[nearest]
+    with pytest.raises(ValueError, match=f"must name joints of the model, got .*, did you mean {nearest!r}"):
+        mjcf_settings.named("feet", "joints", name, known)
+
+
+@pytest.mark.parametrize("argument", ["held", "arm_swing"])
+def test_a_robot_without_other_joints_has_none_to_hold(argument, tmp_path):
+    path = write_model(tmp_path, arms=False)
+    message = error_of(path, **{argument: {"head": 0.1}})
+    assert message == (
+        f"{argument} must name joints outside of the legs of the model, which has none, got 'head'"
+    )
+
+
 def test_a_leg_of_four_joints_is_named(tmp_path):
     parts = ("hip_roll", "hip_pitch", "knee", "ankle_pitch")
     path = write_model(tmp_path, parts=parts)
@@ -417,10 +463,9 @@ TOMLS = {
     "unknown key": (TOML + "hold = 3", "small.toml has an unknown key 'hold', did you mean 'held'"),
     "missing": (
         'model = "small.xml"',
-        "small.toml must have the keys model, left_leg, right_leg, feet, got none of left_leg, "
-        "right_leg, feet$",
+        "small.toml must have the keys model, left_leg, right_leg, feet; missing: left_leg, right_leg, feet$",
     ),
-    "empty": ("", "must have the keys model, left_leg, right_leg, feet, got none of model, left_leg"),
+    "empty": ("", "must have the keys model, left_leg, right_leg, feet; missing: model, left_leg"),
     "key twice": (TOML + "kp = 1\nkp = 2", "cannot read .*small.toml: "),
     "model 3": (
         TOML.replace('"small.xml"', "3"),
@@ -434,11 +479,20 @@ TOMLS = {
     "no package": (
         TOML.replace("small.xml", "no_such_package:small.xml"),
         "model in .*small.toml must be in an installed package, got 'no_such_package:small.xml': there is no "
-        "package 'no_such_package'$",
+        "package 'no_such_package'; install it, or name the path of the file \\(a file in a subpackage is "
+        "package:folder/file\\)$",
     ),
-    "no package name": (TOML.replace("small.xml", "C:small.xml"), "there is no package 'C'$"),
-    "main": (TOML.replace("small.xml", "__main__:small.xml"), "there is no package '__main__'$"),
-    "a module": (TOML.replace("small.xml", "tomllib.x:small.xml"), "there is no package 'tomllib.x'$"),
+    "no package name": (TOML.replace("small.xml", "C:small.xml"), "there is no package 'C'; install it"),
+    "main": (TOML.replace("small.xml", "__main__:small.xml"), "there is no package '__main__'; install it"),
+    "a module": (
+        TOML.replace("small.xml", "tomllib.x:small.xml"),
+        "there is no package 'tomllib.x'; install it, or",
+    ),
+    "a long path": (
+        TOML.replace("small.xml", "a" * 5000),
+        "the model must be an MJCF file, got .*a, which is no",
+    ),
+    "a path with a zero": (TOML.replace("small.xml", r"a\u0000.xml"), "the model must be an MJCF file, got "),
     "no file of a package": (
         TOML.replace("small.xml", "creps_jax:no.xml"),
         "creps_jax.no.xml, which is no file$",
