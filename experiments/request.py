@@ -164,7 +164,7 @@ def settings_of(experiment: registry.Experiment, path: Path, manifest: Mapping[s
     try:
         return plain.read(experiment.Settings, manifest["settings"], "settings")
     except UserError as error:
-        raise UserError(f"{path} was made with other settings than this version has: {error}") from error
+        raise UserError(f"cannot use the settings of {path}: {error}") from error
 
 
 def _check_counts(settings: Any) -> None:

@@ -150,7 +150,7 @@ def _drive(command: Drive) -> int:
     import_mjx_quietly()
     from creps_jax.tools import drive
 
-    policy = command.policy or drive.default_policy()
+    policy = command.policy or drive.default_policy(command.robot)
     if command.script is None:
         from creps_jax.tools.drive_live import drive_live
 

@@ -11,14 +11,17 @@ import numpy as np
 
 from creps_jax import files
 from creps_jax.errors import UserError
-from creps_jax.files import policies_folder
+from creps_jax.policies.learned import Learned, load
+from creps_jax.robots.robot import NAO
 from creps_jax.simulation import c
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tasks.steering import Drive, record_drive
+from creps_jax.tools import play
 from creps_jax.tools.play import load_walking_policy, robot_of, save_film
+from creps_jax.tools.robots import is_spec
 from creps_jax.tools.video import Clip
 from creps_jax.walking.controller import Walker
-from creps_jax.walking.gaits import COMMAND_NAMES, learned_walker
+from creps_jax.walking.gaits import COMMAND_NAMES, command_range, learned_walker
 
 COLUMNS = ("time", *COMMAND_NAMES)
 _LONGEST = 600.0
@@ -68,9 +71,18 @@ def _numbers(path: Path, line: int, row: Sequence[str]) -> list[float]:
     return numbers
 
 
-def default_policy() -> Path:
-    """Return the shipped policy of the NAO that can be steered."""
-    return policies_folder() / "steer.npz"
+def default_policy(robot: str | None = None) -> Path:
+    """Return the shipped policy of a robot that can be steered, or else the policy that `play` shows.
+
+    Args:
+        robot: name of the robot, or the file that describes it; None is the NAO.
+
+    Raises:
+        UserError: if there is neither, or the robot is unknown.
+    """
+    shipped = files.policies_folder(robot or NAO.name) / "steer.npz"
+    is_shipped = not is_spec(robot or NAO.name) and shipped.exists()
+    return shipped if is_shipped else play.default_policy(robot)
 
 
 def drive_by_script(
@@ -101,10 +113,23 @@ def drive_by_script(
     commands = read_script(script)
     walker = load_walker(policy, robot)
     say(f"policy: {policy}")
+    for line in beyond_range(load(policy), commands):
+        say(line)
     drive = drive_by_commands(walker, commands, seed=seed)
     for line in report(commands, drive):
         say(line)
     save_film([Clip(captions(drive), np.asarray(drive.qpos), CONTROL_PERIOD)], out, say, robot=walker.robot)
+
+
+def beyond_range(learned: Learned, commands: np.ndarray) -> list[str]:
+    """Return a note for each axis on which commands (n, 3) are beyond what a policy has learned."""
+    axes = zip(COMMAND_NAMES, commands.T, *command_range(learned), strict=True)
+    return [
+        f"note: {name} is limited to the learned range, {low:g} to {high:g}; the script asks for "
+        f"{asked.min():g} to {asked.max():g}"
+        for name, asked, low, high in axes
+        if asked.min() < low or asked.max() > high
+    ]
 
 
 def captions(drive: Drive) -> list[str]:

@@ -184,7 +184,10 @@ def shipped_policy(robot: str | None = None) -> Path:
         asked = "" if robot == NAO.name else f" --robot {shlex.quote(robot)}"
         # The command chooses the preset of a robot that a file describes.
         preset = "" if is_spec(robot) else " --preset quick"
-        raise UserError(f"no policy has been learned yet: python -m experiments run walk{asked}{preset}")
+        raise UserError(
+            f"no policy has been learned yet in {Path.cwd() / 'results'}; name a file with --policy, or "
+            f"learn one: python -m experiments run walk{asked}{preset}"
+        )
     return shipped
 
 
@@ -239,7 +242,8 @@ def robot_of(policy: Learned, robot: str | None = None) -> Robot:
         robot = name if name in ROBOTS else spec
     found = find_robot(robot).robot
     if found.name != name:
-        raise UserError(f"the policy is of the robot {name}, not of {found.name}")
+        note = f"; its description may say name = {name!r}" if is_spec(robot) and name not in ROBOTS else ""
+        raise UserError(f"the policy is of the robot {name}, not of {found.name}{note}")
     return found
 
 

@@ -59,6 +59,8 @@ def find_robot(name: str) -> RobotRanges:
     if is_spec(name):
         path = robot_id(name)
         return _read_spec(path, _last_changes(path))
+    if name.endswith((".xml", ".mjcf", ".urdf")):
+        raise UserError(f"a robot must be described by a {SPEC_SUFFIX} file that names its model, got {name}")
     if name not in ROBOTS:
         raise UserError(f"unknown robot {name!r}{suggest(name, ROBOTS)}, or name a {SPEC_SUFFIX} file")
     return ROBOTS[name]

@@ -1,6 +1,7 @@
 """Settings of the walking experiments, and their presets."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from functools import cached_property, partial
 from typing import Any
@@ -13,6 +14,7 @@ from creps_jax.contexts import gaussian_contexts, uniform_contexts
 from creps_jax.errors import UserError
 from creps_jax.policies.bounds import RUN_CONSTRAINTS, SIGMOID
 from creps_jax.policies.feature_settings import Features
+from creps_jax.robots.robot import GRAVITY
 from creps_jax.simulation import c, mjx
 from creps_jax.simulation.state import ControlStep
 from creps_jax.tasks.conditions import Condition
@@ -148,6 +150,17 @@ class Settings:
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise UserError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+        self._check_speeds()
+
+    def _check_speeds(self) -> None:
+        """Check the range of the speeds; a leg cannot walk with a Froude number above 1."""
+        (low, *_), (high, *_) = self.context_range()
+        fastest = math.sqrt(GRAVITY * self.ranges().robot.leg_length)
+        if not 0 <= low < high <= fastest:
+            raise UserError(
+                f"low and high must be speeds with 0 <= low < high <= {fastest:.2f} m/s, the fastest walk of "
+                f"the leg (Froude number 1), got {low:g} and {high:g}"
+            )
 
     def resolved(self) -> "Settings":
         """Return the settings with a value in place of each None and "auto" that stands for one."""

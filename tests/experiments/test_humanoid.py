@@ -74,9 +74,11 @@ def test_a_robot_without_a_policy_is_told_the_command_that_learns_one(spec, tmp_
     path = tmp_path / "a folder" / "small.toml"
     shutil.copytree(spec.parent, path.parent)
     shutil.move(path.parent / spec.name, path)
-    with pytest.raises(UserError, match="no policy has been learned yet: ") as caught:
+    with pytest.raises(
+        UserError, match=r"no policy has been learned yet in .*results; name a file"
+    ) as caught:
         play.default_policy(str(path))
-    command = str(caught.value).partition(": ")[2]
+    command = str(caught.value).partition("learn one: ")[2]
     assert "--preset" not in command
     program, _, module, *arguments = shlex.split(command)
     assert (program, module, arguments) == ("python", "experiments", ["run", "walk", "--robot", str(path)])
@@ -161,3 +163,13 @@ def test_standard_gaits_are_eighteen_at_three_speeds(spec):
     trials = robot_check.try_standard_gaits(ranges)
     assert len(trials) == 18
     assert {trial.asked for trial in trials} == {ranges.low, 0.5 * (ranges.low + ranges.high), ranges.high}
+
+
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [(0.3, 0.1), (0.2, 0.2), (-0.1, 0.3), (0.1, 30.0), (0.1, np.nan), (None, np.inf)],
+)
+def test_speeds_out_of_range_are_refused_before_anything_is_learned(spec, low, high):
+    settings = {"robot": str(spec), "low": low, "high": high}
+    with pytest.raises(UserError, match=r"0 <= low < high <= .* m/s, the fastest walk .*, got .* and"):
+        dataclasses.replace(SETTINGS["humanoid"], **settings)

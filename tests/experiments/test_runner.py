@@ -158,7 +158,7 @@ def test_settings_of_another_version_are_named(tiny):
     folder = run(changes={"iterations": 1}, out=Path("done"))
     manifest = results.load_manifest(folder)
     (folder / "manifest.json").write_text(json.dumps({**manifest, "settings": {"foo": 1}}))
-    with pytest.raises(UserError, match="other settings"):
+    with pytest.raises(UserError, match="cannot use the settings of"):
         run(out=folder, resume=True)
 
 
@@ -167,8 +167,11 @@ def test_settings_of_another_version_are_named(tiny):
     [
         ({"seed": "x"}, "must have a whole number as seed, got 'x'"),
         ({"seed": -3}, "seed must be from 0 to"),
-        ({"settings": {"iterations": "5"}}, "other settings .* iterations must be a whole number, got '5'"),
-        ({"settings": {"speeds": None}}, "other settings .* speeds must be a list, got None"),
+        (
+            {"settings": {"iterations": "5"}},
+            "cannot use .* iterations must be a whole number, got '5'",
+        ),
+        ({"settings": {"speeds": None}}, "cannot use .* speeds must be a list, got None"),
         ({"experiment": "walk"}, r"manifest\.json is of 'walk', expected 'tiny'"),
     ],
 )

@@ -215,7 +215,7 @@ def test_mistakes_are_one_clear_line(bench, monkeypatch, capsys):
     Path("bad.npz").write_text("no policy")
     for match, arguments in (
         ("no policy has been learned yet", ["play", "--speed", "0.3"]),
-        ("yet: python -m experiments run walk --robot nao_h25 --", ["play", "--robot", "nao_h25"]),
+        ("one: python -m experiments run walk --robot nao_h25 --", ["play", "--robot", "nao_h25"]),
         ("unknown robot 'nao_h26', did you mean 'nao_h25'?", ["play", "--robot", "nao_h26"]),
         ("cannot read bad.npz", ["play", "--speed", "0.3", "--policy", "bad.npz"]),
         ("no such file: none.npz", ["play", "--policy", "none.npz"]),

@@ -8,7 +8,15 @@ from creps_jax.files import policies_folder
 from creps_jax.policies.learned import load
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD
 from creps_jax.tools import cli
-from creps_jax.tools.drive import captions, drive_by_commands, load_walker, read_script, report
+from creps_jax.tools.drive import (
+    beyond_range,
+    captions,
+    default_policy,
+    drive_by_commands,
+    load_walker,
+    read_script,
+    report,
+)
 from creps_jax.tools.drive_live import Command, LiveRobot
 from creps_jax.walking.gaits import command_range
 
@@ -50,6 +58,23 @@ def test_a_bad_script_is_named(text, expected, tmp_path):
         path.write_text(text)
     with pytest.raises(UserError, match=expected):
         read_script(path)
+
+
+def test_commands_beyond_the_learned_range_are_noted():
+    policy = load(policies_folder() / "steer.npz")
+    commands = np.zeros((10, 3), np.float32)
+    assert beyond_range(policy, commands) == []
+    commands[:4, 0], commands[5:, 2] = 1.0, -2.0
+    notes = beyond_range(policy, commands)
+    assert [note.split()[1] for note in notes] == ["vx", "turn"]
+    assert "-0.2 to 0.6; the script asks for 0 to 1" in notes[0]
+    straight = load(policies_folder() / "walk.npz")
+    assert [note.split()[1] for note in beyond_range(straight, commands)] == ["vx"]
+
+
+def test_a_robot_without_a_steered_policy_is_driven_by_its_straight_walk():
+    assert default_policy().name == "steer.npz"
+    assert default_policy("nao_h25").parent == policies_folder("nao_h25")
 
 
 def test_a_drive_is_reported_and_captioned(walker):

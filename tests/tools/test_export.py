@@ -352,6 +352,8 @@ def test_mistakes_are_one_clear_line(folder, capsys):
         save(folder / f"{name}.npz", policy)
     (folder / "file").touch()
     (folder / "folder.h").mkdir()
+    for name in ("walk.h", "drive.c"):
+        (folder / name).touch()
     walk = ["--to", "walk.csv", "--speed", "0.3"]
     steered = ["--policy", str(STEERED)]
     for match, arguments in (
@@ -375,6 +377,8 @@ def test_mistakes_are_one_clear_line(folder, capsys):
             "vx must be within its range, -0.2 to 0.6 m/s, got 0.7",
             ["--to", "walk.csv", "--speed", "0.7", *steered],
         ),
+        ("would overwrite walk.h with the header", ["--to", "walk.c", *steered]),
+        ("is the name of the header of drive.c", ["--to", "drive.h", *steered]),
         ("is the policy file itself", ["--to", "walk.npz", "--speed", "0.3", "--policy", "./walk.npz"]),
     ):
         assert main(["export", *arguments]) == 2, match

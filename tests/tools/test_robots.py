@@ -1,11 +1,15 @@
 """The robots that the commands find by name or by a description."""
 
+import dataclasses
 import os
 import shutil
 
 import pytest
 
 from creps_jax.errors import UserError
+from creps_jax.files import policies_folder
+from creps_jax.policies.learned import load
+from creps_jax.tools import play
 from creps_jax.tools.robots import ROBOTS, find_robot
 from experiments.walk import Settings
 from tests.tools.offset_humanoid import write_spec
@@ -64,6 +68,19 @@ def test_settings_keep_their_robot_while_its_files_are_edited(spec):
     assert settings.ranges() is before is not Settings(robot=str(spec)).ranges()
     shutil.rmtree(spec.parent)
     assert settings.ranges() is before and settings.context_range()[0] == (before.low,)
+
+
+@pytest.mark.parametrize("name", ["robot.xml", "folder/robot.mjcf", "robot.urdf"])
+def test_a_model_needs_a_description(name):
+    with pytest.raises(UserError, match=f"described by a .toml file that names its model, got {name}"):
+        find_robot(name)
+
+
+def test_a_policy_of_a_description_with_another_name_tells_which_name_it_needs(spec):
+    shipped = load(policies_folder() / "walk.npz")
+    policy = dataclasses.replace(shipped, task={**shipped.task, "robot": "before"})
+    with pytest.raises(UserError, match=r"of the robot before, not of .*may say name = 'before'"):
+        play.robot_of(policy, str(spec))
 
 
 def test_the_robots_of_the_library_are_found_by_name():

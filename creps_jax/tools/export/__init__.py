@@ -49,6 +49,7 @@ def export(
     path = policy or _default_policy(robot)
     if _are_the_same(to, path):
         raise UserError(f"--to {to} is the policy file itself, name another file")
+    _check_header(to, ending)
     period = _PERIOD if period is None else period
     if ending in _WHOLE_WALK:
         import_mjx_quietly()
@@ -78,6 +79,15 @@ def export(
         {".onnx": onnx_model.save, ".h": c_header.save}[ending](to, saved)
     say(f"policy: {path}")
     say(f"{(_OF_POLICY | _OF_WALK | _WHOLE_WALK)[ending]}: {to}")
+
+
+def _check_header(to: Path, ending: str) -> None:
+    """Check that a header of a policy and the header of a whole walk do not overwrite each other."""
+    other = to.with_suffix(".c" if ending == ".h" else ".h")
+    if ending == ".h" and other.exists():
+        raise UserError(f"--to {to} is the name of the header of {other}, name another file")
+    if ending in _WHOLE_WALK and other.exists() and not to.exists():
+        raise UserError(f"--to {to} would overwrite {other} with the header of the walk, name another file")
 
 
 def _check_request(to: Path, ending: str, options: dict[str, float | None]) -> None:
