@@ -47,8 +47,9 @@ def humanoid_from_mjcf(
 
     The trunk is the body with the free joint; it must face along x. From the model come the joint axes, the
     soles, the lengths, the centre of mass, and the limits of joints and motors. Each joint gets a position
-    servo. Meshes take no part in contacts; the feet need a box, sphere, capsule, cylinder or ellipsoid. The
-    world, the options, the constraints to the world and the gravity compensation of the file do not apply.
+    servo with the torque of all its actuators. Meshes take no part in contacts; the feet need a box, sphere,
+    capsule, cylinder or ellipsoid. The world, the options, the constraints to the world and the gravity
+    compensation of the file do not apply.
 
     Args:
         path: The MJCF file.

@@ -20,7 +20,9 @@ class Servo(NamedTuple):
 
 
 def read_servos_of(model: mujoco.MjModel, max_torque: float | int | None) -> dict[str, Servo]:
-    """Read the motor of each hinge joint: the smallest torque limit of joint and actuators, and the range.
+    """Read the motor of each hinge joint: its torque limit and its range.
+
+    As in MuJoCo, the torques of the actuators of a joint add up, and the joint limits their sum.
 
     Args:
         model: The compiled robot.
@@ -42,7 +44,8 @@ def read_servos_of(model: mujoco.MjModel, max_torque: float | int | None) -> dic
         is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
         actuators = np.flatnonzero(is_joint & (model.actuator_trnid[:, 0] == joint))
         if not len(actuators):
-            raise ValueError(f"each joint must have an actuator in the model, got none for {name!r}")
+            missing = repr(name) if is_joint.any() else "any joint"
+            raise ValueError(f"each joint must have an actuator in the model, got none for {missing}")
         torque = _torque_limit(model, joint, actuators)
         if not np.isfinite(torque):
             if max_torque is None:
@@ -61,16 +64,27 @@ def read_servos_of(model: mujoco.MjModel, max_torque: float | int | None) -> dic
 
 
 def _torque_limit(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> float:
-    limits = [np.abs(model.jnt_actfrcrange[joint]).min()] if model.jnt_actfrclimited[joint] else []
-    for each in actuators:
-        gear = abs(model.actuator_gear[each, 0])
-        if model.actuator_forcelimited[each]:
-            limits.append(gear * np.abs(model.actuator_forcerange[each]).min())
-        is_motor = model.actuator_biastype[each] == mujoco.mjtBias.mjBIAS_NONE
-        if is_motor and model.actuator_ctrllimited[each]:
-            gain = abs(model.actuator_gainprm[each, 0])
-            limits.append(gear * gain * np.abs(model.actuator_ctrlrange[each]).min())
-    return float(min(limits, default=np.inf))
+    """Return the largest torque that a joint can have in both directions, N m."""
+    low, high = np.sum([_torques(model, each) for each in actuators.tolist()], axis=0)
+    if model.jnt_actfrclimited[joint]:
+        least, most = model.jnt_actfrcrange[joint]
+        low, high = max(low, least), min(high, most)
+    return float(min(0.0 - low, high))
+
+
+def _torques(model: mujoco.MjModel, actuator: int) -> tuple[float, float]:
+    """Return the lowest and the highest torque of an actuator at its joint, N m."""
+    gear = model.actuator_gear[actuator, 0]
+    if gear == 0.0:
+        return 0.0, 0.0
+    low, high = -np.inf, np.inf
+    if model.actuator_forcelimited[actuator]:
+        low, high = model.actuator_forcerange[actuator]
+    is_motor = model.actuator_biastype[actuator] == mujoco.mjtBias.mjBIAS_NONE
+    if is_motor and model.actuator_ctrllimited[actuator]:
+        ends = model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[actuator]
+        low, high = max(low, ends.min()), min(high, ends.max())
+    return min(gear * low, gear * high), max(gear * low, gear * high)
 
 
 def _range_of(model: mujoco.MjModel, joint: int, actuators: np.ndarray) -> tuple[float, float]:

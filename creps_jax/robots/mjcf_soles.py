@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from creps_jax.robots.humanoid import LegChain
-from creps_jax.robots.mjcf_legs import Leg, foot_pose, is_below, pitch_joints, posed
+from creps_jax.robots.mjcf_legs import Leg, foot_pose, is_below, leg_length, pitch_joints, posed
 from creps_jax.typing import Float
 
 # Only `humanoid_from_mjcf` is public.
@@ -96,17 +96,27 @@ def level_pose(
 
 
 def read_sole(model: mujoco.MjModel, level: mujoco.MjData, chain: LegChain, leg: Leg) -> Sole:
-    """Read the sole of a leg in a pose in which it is level."""
+    """Read the sole of a leg in a pose in which it is level.
+
+    Raises:
+        ValueError: If the sole is above the ankle, or farther below it than the leg is long.
+    """
     points = level.xanchor[list(leg.ids)]
     _, _, ankle = pitch_joints(chain.axes, leg)
     touching, _, _ = _touching(model, level, leg)
     low, high = touching.min(axis=0), touching.max(axis=0)
+    length, ankle_height = leg_length(chain, leg), float(points[ankle, 2] - low[2])
+    if not 0.0 < ankle_height < length:
+        raise ValueError(
+            f"the height of the ankle above the sole of {leg.foot!r} must be above 0 and below the length of "
+            f"the leg, {length:.3f} m, got {ankle_height:.3f} m: correct the place or the size of its geoms"
+        )
     place = np.array([points[ankle, 0], points[-1, 1], low[2]])
     T_trunk_sole = np.eye(4)
     T_trunk_sole[:3, 3] = place
     return Sole(
         place=place,
-        ankle_height=float(points[ankle, 2] - low[2]),
+        ankle_height=ankle_height,
         middle=float(0.5 * (low[0] + high[0]) - place[0]),
         right_edge=float(place[1] - _lowest_y(model, level, leg)),
         T_foot_sole=np.linalg.inv(foot_pose(model, level, leg)) @ T_trunk_sole,

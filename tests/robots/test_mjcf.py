@@ -107,16 +107,48 @@ def test_soles_of_all_shapes_have_the_same_height(foot, tmp_path):
         ('<velocity name="{name}" joint="{name}" kv="1" forcerange="-5 5"/>', 5.0),
         (
             '<motor name="{name}" joint="{name}" ctrlrange="-8 8"/>'
-            '<motor name="{name}_2" joint="{name}" ctrlrange="-4 4"/>',
-            4.0,
+            '<motor name="{name}_2" joint="{name}" gear="-2" ctrlrange="-2 2"/>',
+            12.0,
         ),
+        (
+            '<motor name="{name}" joint="{name}" ctrlrange="0 8"/>'
+            '<motor name="{name}_2" joint="{name}" ctrlrange="-7 0"/>',
+            7.0,
+        ),
+        (POSITION + POSITION.replace('name="{name}"', 'name="{name}_2"').replace("-7 6", "-1 2"), 8.0),
+        (POSITION + '<velocity name="{name}_2" joint="{name}" kv="1" forcerange="-5 5"/>', 11.0),
+        ('<motor name="{name}" joint="{name}" ctrlrange="-8 8"/><motor joint="{name}" gear="0"/>', 8.0),
     ],
-    ids=["ctrlrange", "negative gear", "forcerange", "smallest", "general", "position", "velocity", "two"],
+    ids=[
+        "ctrlrange",
+        "negative gear",
+        "forcerange",
+        "smallest",
+        "general",
+        "position",
+        "velocity",
+        "two motors",
+        "one motor for each direction",
+        "two servos",
+        "servo and damper",
+        "motor without gear",
+    ],
 )
-def test_torque_is_the_smallest_limit_of_the_actuators(motor, torque, tmp_path):
+def test_torque_is_the_sum_of_the_limits_of_the_actuators(motor, torque, tmp_path):
     robot = read(tmp_path, motor=motor, arms=False)
     assert robot.max_joint_torque == pytest.approx((torque,) * 12)
     np.testing.assert_allclose(read_servos(robot.model).torque_range, [[-torque] * 12, [torque] * 12])
+
+
+def test_the_torque_of_several_actuators_is_that_of_mujoco(tmp_path):
+    knee = MOTOR.format(name="left_knee")
+    second = '<motor name="second" joint="left_knee" ctrlrange="-3 3"/>'
+    robot = read(tmp_path, (knee, knee + second))
+    data = mujoco.MjData(own := mujoco.MjModel.from_xml_path(str(tmp_path / "small.xml")))
+    data.ctrl[:] = own.actuator_ctrlrange[:, 1]
+    mujoco.mj_forward(own, data)
+    torque = data.joint("left_knee").qfrc_actuator[0]
+    assert robot.max_joint_torque[joint(robot, "left_knee")] == pytest.approx(torque) == pytest.approx(19.0)
 
 
 def test_torque_may_be_limited_by_the_joint_or_given(tmp_path):

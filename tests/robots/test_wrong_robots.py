@@ -67,11 +67,19 @@ MODELS = {
         [(KNEE_MOTOR, "")],
         "each joint must have an actuator in the model, got none for 'left_knee'$",
     ),
+    "no actuators": (
+        {"motor": ""},
+        "each joint must have an actuator in the model, got none for any joint$",
+    ),
     "no torque limit": (
         [(KNEE_MOTOR, NO_LIMIT.format(name="left_knee"))],
         "the torque of 'left_knee' must have a limit: its joint has no actuatorfrcrange, and its actuator "
         "has neither a forcerange nor, as a motor, a ctrlrange; state one in the model, or max_torque in the "
         "description$",
+    ),
+    "one of two actuators without a limit": (
+        [(KNEE_MOTOR, KNEE_MOTOR + '<motor joint="left_knee"/>')],
+        "the torque of 'left_knee' must have a limit: its joint has no actuatorfrcrange, and its actuator",
     ),
     "torque in one direction": (
         [(KNEE_MOTOR, KNEE_MOTOR.replace('"-8 8"', '"0 8"'))],
@@ -154,6 +162,28 @@ MODELS = {
             )
         ],
         "the sole of 'left_foot' must have a length, got a row of points from left to right$",
+    ),
+    "soles above the ankles": (
+        [('-0.03" size="0.09', '0.3" size="0.09')],
+        "the height of the ankle above the sole of 'left_foot' must be above 0 and below the length of the "
+        "leg, 0.401 m, got -0.270 m: correct the place or the size of its geoms$",
+    ),
+    "soles just above the ankles": (
+        [('-0.03" size="0.09', '0.031" size="0.09')],
+        "the height of the ankle above the sole of 'left_foot' must be above 0 and .* got -0.001 m",
+    ),
+    "feet in millimetres": (
+        [('size="0.09 0.045 0.01"', 'size="90 45 10"')],
+        "the height of the ankle above the sole of 'left_foot' must be .* 0.401 m, got 10.050 m",
+    ),
+    "one foot in millimetres": (
+        [
+            (
+                'name="right_sole" type="box" pos="0.03 -0.005 -0.03" size="0.09 0.045 0.01"',
+                'name="right_sole" type="box" size="90 45 10"',
+            )
+        ],
+        "the height of the ankle above the sole of 'right_foot' must be .* 0.401 m, got 10.020 m",
     ),
     "legs in one line": (
         [
