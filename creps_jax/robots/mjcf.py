@@ -20,6 +20,8 @@ __all__ = ["humanoid_from_mjcf"]
 # Gains of the servos: stiffness relative to weight times leg, and the damping time for a NAO's leg, s.
 # At a quarter of this stiffness robots of 20 to 33 kg fall in all gaits.
 _STIFFNESS, _DAMPING_TIME = 10.0, 0.01
+# The least stiffness, relative to this one.
+_SOFTEST = 0.01
 # Speeds of the simulated NAO, m/s; those of another robot have the same Froude number if they are not given.
 _NAO_SPEEDS = (0.1, 0.5)
 # Distance between the soles for a leg of the NAO's length, m.
@@ -56,21 +58,24 @@ def humanoid_from_mjcf(
         left_leg: Names of the joints of the left leg, from the hip to the ankle; five or six.
         right_leg: Those of the right leg, which must mirror the left one.
         feet: Names of the left and the right foot body.
-        name: Name of the robot; by default that of the file.
+        name: Name of the robot, one line; by default that of the file.
         crouch: Angles of the left leg with bent knees, rad; by default knees bent forwards. Soles that are
             not level with all leg angles zero must be level with these, the feet pointing along x.
         held: Angles at which other joints are held, by name, rad; zero by default.
         arm_swing: Change of a joint's angle for each metre that the left foot is ahead of the right one, by
             name, rad/m; none by default.
-        kp: Stiffness of the servos, N m/rad; by default ten times weight times leg.
+        kp: Stiffness of the servos, N m/rad; by default ten times weight times leg, and at least a
+            hundredth of it.
         kv: Damping of the servos, N m s/rad; by default `kp` times 0.01 s, times the square root of the leg's
             length relative to that of the NAO.
-        max_speed: Largest speed of all joints, or of each by name, rad/s; 8 by default.
+        max_speed: Largest speed of all joints, or of each by name, rad/s; 8 by default, at
+            most 100.
         max_torque: Torque of the motors for which the model states no limit, N m.
         foot_spacing: Distance between the ankles when standing and walking, m; less than the length of the
-            leg. By default the soles of legs of six joints are close to each other, but not farther apart
-            than the hips: the narrower the stance, the less torque the hips need to carry the robot on one
-            foot. Feet of legs of five joints are below the hips.
+            leg, and so large that the feet do not overlap. By default the soles of legs of six joints are
+            close to each other, but not farther apart than the hips: the narrower the stance, the less
+            torque the hips need to carry the robot on one foot. Feet of legs of five joints are below the
+            hips.
         speeds: Lowest and highest speed at which it is to walk, m/s; by default those of a NAO, scaled. The
             Froude number, speed^2 / (g leg), is at most 1.
 
@@ -84,7 +89,7 @@ def humanoid_from_mjcf(
     source = {key: value for key, value in locals().items() if value is not None and key != "path"}
     checks.instance("path", path, str, Path)
     if name is not None:
-        checks.instance("name", name, str)
+        mjcf_settings.check_name(name)
     path = Path(path)
     joints = tuple(
         mjcf_settings.checked_names(argument, values, mjcf_settings.LEG)
@@ -106,7 +111,8 @@ def humanoid_from_mjcf(
     swing = mjcf_settings.by_joint("arm_swing", arm_swing, mjcf_settings.OTHERS, others)
     max_speeds = mjcf_settings.checked_max_speeds(max_speed, names)
     chains, soles, crouches = _read_chains(model, legs, servos, held, crouch)
-    mjcf_settings.check_size(mjcf_legs.leg_length(chains[0], legs[0]), foot_spacing, speeds)
+    length = mjcf_legs.leg_length(chains[0], legs[0])
+    mjcf_settings.check_size(length, soles[0].right_edge, foot_spacing, speeds)
     posture = mjcf_posture.standing_posture(chains, legs, soles, names, held, crouches)
     mjcf_posture.check_kinematics(model, chains, legs, soles, held)
     return _assembled(
@@ -216,9 +222,19 @@ def _assembled(
 def _servo_gains(
     gains: tuple[float | int | None, float | int | None], mass: float, length: float
 ) -> tuple[float, float]:
-    """Return stiffness and damping of the servos: the given ones, or those from weight and leg."""
+    """Return stiffness and damping of the servos: the given ones, or those from weight and leg.
+
+    Raises:
+        ValueError: If the legs are too soft to carry the robot.
+    """
     kp, kv = gains
-    kp = _STIFFNESS * mass * GRAVITY * length if kp is None else kp
+    usual = _STIFFNESS * mass * GRAVITY * length
+    kp = usual if kp is None else kp
+    if not kp >= _SOFTEST * usual:
+        raise ValueError(
+            f"kp must be at least {_SOFTEST * usual:.3g} N m/rad, a hundredth of its default, got {kp:g}: "
+            "softer legs cannot carry the robot"
+        )
     # A number below 0 that float32 cannot hold is 0.
     kv = kp * _DAMPING_TIME * np.sqrt(length / NAO_LEG_LENGTH) if kv is None else max(kv, 0.0)
     return float(kp), float(kv)

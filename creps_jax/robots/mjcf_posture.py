@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from creps_jax import checks
 from creps_jax.robots.humanoid import LegChain
 from creps_jax.robots.mjcf_legs import (
     FIRST_BEND,
@@ -19,7 +18,7 @@ from creps_jax.robots.mjcf_legs import (
     pitch_joints,
     posed,
 )
-from creps_jax.robots.mjcf_settings import ROUNDING
+from creps_jax.robots.mjcf_settings import ROUNDING, numbers
 from creps_jax.robots.mjcf_soles import Sole
 from creps_jax.robots.screw_kinematics import chain_fk, chain_ik
 
@@ -66,11 +65,8 @@ def crouches_of_both(crouch: Any, chains: Sequence[LegChain], legs: Sequence[Leg
 
 def _checked_crouch(crouch: Any, chain: LegChain, leg: Leg) -> np.ndarray:
     """Return the angles of the left leg with bent knees after checking them."""
-    angles = checks.finite("crouch", checks.vector("crouch", crouch))
-    if angles.shape != (len(leg.joints),):
-        raise ValueError(
-            f"crouch must have an angle for each of {', '.join(leg.joints)}, got {checks.shown(crouch)}"
-        )
+    expected = f"have an angle for each of {', '.join(leg.joints)}"
+    angles = numbers("crouch", crouch, len(leg.joints), expected)
     _, knee, _ = pitch_joints(chain.axes, leg)
     for i in (knee, *range(len(angles))):
         if not chain.lower[i] - ROUNDING <= angles[i] <= chain.upper[i] + ROUNDING:

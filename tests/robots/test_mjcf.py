@@ -250,6 +250,11 @@ def test_what_is_given_is_taken(path):
     assert humanoid_from_mjcf(path, **SPEC, max_speed=5.0).max_joint_speed == (5.0,) * 15
 
 
+@pytest.mark.parametrize("spacing", [0.081, 0.4])
+def test_feet_may_be_as_close_as_they_are_wide_or_almost_a_leg_apart(spacing, path):
+    assert humanoid_from_mjcf(path, **SPEC, foot_spacing=spacing).foot_spacing == spacing
+
+
 def test_a_crouch_leads_to_the_same_posture_with_the_signs_of_the_right_leg(path, robot):
     crouched = humanoid_from_mjcf(path, **SPEC, crouch=[0.0, 0.0, -0.9, 1.6, -0.7, 0.0])
     np.testing.assert_allclose(crouched.posture, robot.posture, atol=1e-4)
@@ -496,6 +501,11 @@ def test_two_robots_do_not_know_each_other(path, robot, tmp_path):
     for found in (again, robot):
         assert (found.leg_length, found.posture, found.model.nu) == before[:3]
         np.testing.assert_array_equal(found.model.actuator_gainprm, before[3])
+
+
+@pytest.mark.parametrize("name", ["my/robot", "Läufer 2.1", "K1 (v2)"])
+def test_a_robot_may_have_any_name_of_one_line(name, path):
+    assert humanoid_from_mjcf(path, **SPEC, name=name, kp=2.5, max_speed=100).name == name
 
 
 def test_names_may_be_any(tmp_path):

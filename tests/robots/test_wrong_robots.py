@@ -277,7 +277,10 @@ ARGUMENTS = {
     ),
     "feet swapped": ({"feet": SPEC["feet"][::-1]}, "'right_foot' must come below 'left_ankle_roll'"),
     "one leg twice": ({"right_leg": LEFT}, "right_leg must list .* 'right_foot' must come below"),
-    "one foot twice": ({"feet": ["left_foot", "left_foot"]}, "feet must have each name once, got"),
+    "one foot twice": (
+        {"feet": ["left_foot", "left_foot"]},
+        "feet must have each name once, got 'left_foot' repeatedly$",
+    ),
     "foot above the ankle": (
         {"feet": ["left_knee_link", "right_foot"]},
         "left_leg must list .* 'left_knee_link' must come below 'left_ankle_roll'",
@@ -307,7 +310,14 @@ ARGUMENTS = {
         {"left_leg": LEFT[:-1], "right_leg": RIGHT[:-1]},
         "left_leg must list all joints from hip to foot; missing: left_ankle_roll",
     ),
-    "joint twice": ({"left_leg": [*LEFT[:5], LEFT[4]]}, "left_leg must have each name once, got"),
+    "joint twice": (
+        {"left_leg": [*LEFT[:5], LEFT[4]]},
+        "left_leg must have each name once, got 'left_ankle_pitch' repeatedly$",
+    ),
+    "two joints twice": (
+        {"right_leg": [*RIGHT[:2], *RIGHT[1:3], RIGHT[2], RIGHT[2]]},
+        "right_leg must have each name once, got 'right_hip_roll', 'right_hip_pitch' repeatedly$",
+    ),
     "four joints": (
         {"left_leg": LEFT[1:5]},
         "left_leg must be the names of 5 or 6 joints, from hip to ankle, got",
@@ -334,6 +344,11 @@ ARGUMENTS = {
         "feet must be the names of 2 bodies, the left and the right foot, got",
     ),
     "name 3": ({"name": 3}, "name must be of type str, got 3$"),
+    "name of two lines": (
+        {"name": "my\nrobot"},
+        "name must be one line of printable characters, got 'my.*robot'$",
+    ),
+    "blank name": ({"name": " "}, "name must be one line of printable characters, got ' '$"),
     "backward crouch": (
         {"crouch": [0.0, 0.0, 0.4, -0.8, 0.4, 0.0]},
         "crouch must have 'left_knee' from 0.00 to 2.20 rad, where the knee is bent forwards, got -0.8$",
@@ -347,10 +362,23 @@ ARGUMENTS = {
         "crouch must have an angle for each of left_hip_yaw, left_hip_roll, .*, got",
     ),
     "crouch 0.3": ({"crouch": 0.3}, "crouch must have an angle for each of left_hip_yaw"),
-    "crouch no numbers": ({"crouch": ["a"] * 6}, "crouch must be a number or a vector of numbers, got"),
+    "crouch no numbers": (
+        {"crouch": ["a"] * 6},
+        "crouch must have an angle for each of left_hip_yaw, left_hip_roll, .*, got \\['a', ",
+    ),
+    "crouch of lists": ({"crouch": [[0.1], 0.2]}, "crouch must have an angle for each of left_hip_yaw"),
     "crouch not finite": ({"crouch": [float("nan")] * 6}, "crouch must be finite, got nan"),
     "kp a": ({"kp": "a"}, "kp must be a number, got 'a'$"),
     "kp 0": ({"kp": 0.0}, "kp must be finite and above 0, got 0.0$"),
+    "kp of a spring": (
+        {"kp": 0.4},
+        "kp must be at least 2.48 N m/rad, a hundredth of its default, got 0.4: softer legs cannot carry the "
+        "robot$",
+    ),
+    "kp that float32 rounds to 0": (
+        {"kp": 1e-60},
+        "kp must be finite and above 0, got 1e-60, which float32 cannot hold$",
+    ),
     "kv below 0": ({"kv": -1.0}, "kv must be finite and at least 0, got -1.0$"),
     "max_speed a": ({"max_speed": "a"}, "max_speed must be a number, got 'a'$"),
     "max_speed 0": ({"max_speed": 0}, "max_speed must be finite and above 0, got 0$"),
@@ -362,6 +390,14 @@ ARGUMENTS = {
         {"max_speed": {"left_kne": 3.0}},
         "max_speed must name joints of the model, got 'left_kne', did you mean 'left_knee'",
     ),
+    "max_speed in degrees": (
+        {"max_speed": 300},
+        "max_speed must be at most 100 rad/s, got 300: convert degrees to radians$",
+    ),
+    "max_speed of a joint in degrees": (
+        {"max_speed": {"left_knee": 3.0, "head": 180.0}},
+        "max_speed of head must be at most 100 rad/s, got 180: convert",
+    ),
     "max_torque 0": ({"max_torque": 0.0}, "max_torque must be finite and above 0, got 0.0$"),
     "max_torque a": ({"max_torque": "a"}, "max_torque must be a number, got 'a'$"),
     "foot_spacing 0": ({"foot_spacing": 0.0}, "foot_spacing must be finite and above 0, got 0.0$"),
@@ -371,6 +407,12 @@ ARGUMENTS = {
         "foot_spacing must be below the length of the leg, 0.401 m, got 12$",
     ),
     "feet a leg apart": ({"foot_spacing": 0.41}, "foot_spacing must be below the length of the leg"),
+    "feet that overlap": (
+        {"foot_spacing": 0.02},
+        "foot_spacing must be above 0.080 m, so that the feet, which reach 0.040 m inwards from the ankles, "
+        "do not overlap, got 0.02$",
+    ),
+    "feet that touch": ({"foot_spacing": 0.0799}, "foot_spacing must be above 0.080 m, .* got 0.0799$"),
     "speeds of a car": (
         {"speeds": [5, 30]},
         r"speeds must be at most 1.98 m/s, the fastest walk of a leg of 0.401 m \(Froude number 1\), got 30$",
@@ -382,7 +424,12 @@ ARGUMENTS = {
     ),
     "speeds equal": ({"speeds": (0.5, 0.5)}, "speeds must be two numbers, the lower first, got"),
     "speeds from 0": ({"speeds": (0.0, 0.5)}, "speeds must be finite and above 0, got 0.0$"),
-    "speeds of words": ({"speeds": ("slow", "fast")}, "speeds must be a number or a vector of numbers, got"),
+    "speeds of words": (
+        {"speeds": ("slow", "fast")},
+        r"speeds must be two numbers, the lower first, got \('slow', 'fast'\)$",
+    ),
+    "speeds as text": ({"speeds": ["0.05", "0.35"]}, "speeds must be two numbers, the lower first, got"),
+    "speeds not finite": ({"speeds": [0.1, float("nan")]}, "speeds must be finite, got nan$"),
     "speed 0.3": ({"speeds": 0.3}, "speeds must be two numbers, the lower first, got 0.3$"),
     "three speeds": ({"speeds": (0.1, 0.2, 0.3)}, "speeds must be two numbers, the lower first, got"),
 }
