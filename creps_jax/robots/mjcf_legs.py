@@ -16,6 +16,8 @@ __all__: list[str] = []
 
 # Bend of the knee, of the first guess and the least, rad.
 FIRST_BEND, _LEAST_BEND = 0.6, 0.03
+# Bend in the middle of the range that tells whether the knee is ahead or behind, rad.
+_CLEAR_BEND = 0.3
 # An axis is along y if its y component is larger than this.
 _ALONG = 0.8
 _TURN = 2.0 * np.pi
@@ -165,9 +167,11 @@ def check_mirrored(chains: Sequence[LegChain], legs: Sequence[Leg]) -> None:
             f"both legs must have equally many joints, got {legs[0].joints} and {legs[1].joints}"
         )
     if not left.points[-1, 1] > 0.0 > right.points[-1, 1]:
+        is_exchanged = left.points[-1, 1] < 0.0 < right.points[-1, 1]
         raise ValueError(
             "left_leg must be on the left side, where y is positive, and right_leg on the right, got "
             f"ankles at y = {left.points[-1, 1]:.3f} and {right.points[-1, 1]:.3f} m"
+            f"{_cause_of_exchange(left, legs[0]) if is_exchanged else ''}"
         )
     mirror, axes = np.array([1.0, -1.0, 1.0]), mirrored_axes(left)
     for i, (first, second) in enumerate(zip(legs[0].joints, legs[1].joints, strict=True)):
@@ -175,11 +179,33 @@ def check_mirrored(chains: Sequence[LegChain], legs: Sequence[Leg]) -> None:
         apart = mirror * left.points[i] - right.points[i]
         # A point may be anywhere on its axis.
         apart = apart - (apart @ axis) * axis
-        if abs(abs(axis @ right.axes[i]) - 1.0) > 1e-2 or np.linalg.norm(apart) > _MIRROR_TOLERANCE:
-            raise ValueError(
-                f"right_leg must mirror left_leg joint by joint, got {first!r} and {second!r}, whose axes "
-                "do not mirror each other"
-            )
+        if abs(abs(axis @ right.axes[i]) - 1.0) > 1e-2:
+            unlike = f"axes {_shown(left.axes[i])} and {_shown(right.axes[i])}"
+        elif np.linalg.norm(apart) > _MIRROR_TOLERANCE:
+            unlike = f"positions {_shown(left.points[i])} and {_shown(right.points[i])} m"
+        else:
+            continue
+        raise ValueError(
+            f"right_leg must mirror left_leg joint by joint, got {first!r} and {second!r}, whose {unlike} do "
+            "not mirror each other"
+        )
+
+
+def _shown(vector: Float[np.ndarray, "3"]) -> str:
+    # Without the sign of a zero.
+    return f"({', '.join(f'{value:.3f}' for value in np.round(vector, 3) + 0.0)})"
+
+
+def _cause_of_exchange(chain: LegChain, leg: Leg) -> str:
+    """Return why the ankle of the left leg is on the right side, as far as its knee tells."""
+    bend, sign = _bend_at_zero(chain, leg)
+    _, knee, _ = pitch_joints(chain.axes, leg)
+    middle = bend + 0.5 * sign * (chain.lower[knee] + chain.upper[knee])
+    if abs(middle) < _CLEAR_BEND:
+        return ": exchange the legs, or turn the trunk so that it faces along x"
+    if middle > 0.0:
+        return ": exchange the legs"
+    return ", and knees that bend backwards: turn the trunk so that it faces along x"
 
 
 def mirrored_axes(chain: LegChain) -> Float[np.ndarray, "k 3"]:
@@ -193,11 +219,8 @@ def with_knee_ahead(chain: LegChain, leg: Leg) -> LegChain:
     Raises:
         ValueError: If it has none.
     """
-    hip, knee, ankle = pitch_joints(chain.axes, leg)
-    thigh, shank = (chain.points[b, ::2] - chain.points[a, ::2] for a, b in ((hip, knee), (knee, ankle)))
-    # Rotations about y from the thigh's direction to that of the shank: positive moves the ankle back.
-    bend = np.arctan2(-shank[0], -shank[1]) - np.arctan2(-thigh[0], -thigh[1])
-    sign = np.sign(chain.axes[knee, 1])
+    _, knee, _ = pitch_joints(chain.axes, leg)
+    bend, sign = _bend_at_zero(chain, leg)
     straight = sign * (_LEAST_BEND - bend)
     lower, upper = chain.lower.copy(), chain.upper.copy()
     if sign > 0:
@@ -205,12 +228,24 @@ def with_knee_ahead(chain: LegChain, leg: Leg) -> LegChain:
     else:
         upper[knee] = min(upper[knee], straight)
     if upper[knee] - lower[knee] < FIRST_BEND:
+        least, most = sorted((bend + sign * chain.lower[knee], bend + sign * chain.upper[knee]))
+        is_ahead = most > _LEAST_BEND
         raise ValueError(
             f"the knee {leg.joints[knee]!r} must bend by {FIRST_BEND} rad or more so that it is ahead of "
             "hip and ankle, where x is positive: in its range, "
-            f"{chain.lower[knee]:.2f} to {chain.upper[knee]:.2f} rad, it bends backwards"
+            f"{chain.lower[knee]:.2f} to {chain.upper[knee]:.2f} rad, it bends "
+            f"{f'forwards from {max(least, 0.0):.2f} to {most:.2f} rad only' if is_ahead else 'backwards'}"
         )
     return chain._replace(lower=lower, upper=upper)
+
+
+def _bend_at_zero(chain: LegChain, leg: Leg) -> tuple[float, float]:
+    """Return how far the knee is bent forwards at zero, rad, and the sign of its angle for bending more."""
+    hip, knee, ankle = pitch_joints(chain.axes, leg)
+    thigh, shank = (chain.points[b, ::2] - chain.points[a, ::2] for a, b in ((hip, knee), (knee, ankle)))
+    # Rotations about y from the thigh's direction to that of the shank: positive moves the ankle back.
+    bend = np.arctan2(-shank[0], -shank[1]) - np.arctan2(-thigh[0], -thigh[1])
+    return float(bend), float(np.sign(chain.axes[knee, 1]))
 
 
 def is_below(model: mujoco.MjModel, lower: int, upper: int) -> bool:

@@ -36,6 +36,13 @@ def swapped(values, first, second):
     return values
 
 
+# All of the robot hangs on a body that is turned by half a turn about z.
+FACES_BACKWARDS = [
+    ('<freejoint name="root"/>', '<freejoint name="root"/><body name="inner" euler="0 0 3.14159265">'),
+    ("</worldbody>", "</body></worldbody>"),
+]
+
+
 # What is wrong: replacements in the model or arguments of `write_model`, arguments of `humanoid_from_mjcf`,
 # and the error.
 MODELS = {
@@ -96,12 +103,13 @@ MODELS = {
     ),
     "right leg not mirrored": (
         [('"right_hip_roll_link" pos="0 0 -0.04"', '"right_hip_roll_link" pos="0 0 -0.09"')],
-        "right_leg must mirror left_leg joint by joint, got 'left_hip_roll' and 'right_hip_roll', whose axes "
-        "do not mirror each other$",
+        "right_leg must mirror left_leg joint by joint, got 'left_hip_roll' and 'right_hip_roll', whose "
+        r"positions \(0.010, 0.060, -0.060\) and \(0.010, -0.060, -0.110\) m do not mirror each other$",
     ),
     "another axis on the right": (
         [('"right_hip_yaw" axis="0 0 -1"', '"right_hip_yaw" axis="0 0.5 -1"')],
-        "right_leg must mirror left_leg joint by joint, got 'left_hip_yaw' and 'right_hip_yaw'",
+        "right_leg must mirror left_leg joint by joint, got 'left_hip_yaw' and 'right_hip_yaw', whose axes "
+        r"\(0.000, 0.000, 1.000\) and \(0.000, 0.447, -0.894\) do not mirror each other$",
     ),
     "knees that bend backwards": (
         both_knees(-2.2, -0.2),
@@ -110,7 +118,26 @@ MODELS = {
     ),
     "knees that hardly bend": (
         both_knees(-2.2, 0.3),
-        "the knee 'left_knee' must bend by 0.6 rad or more .* in its range, -2.20 to 0.30 rad",
+        "the knee 'left_knee' must bend by 0.6 rad or more .* in its range, -2.20 to 0.30 rad, it bends "
+        "forwards from 0.00 to 0.40 rad only$",
+    ),
+    "knees of degrees that hardly bend": (
+        both_knees(0, 0.23),
+        "the knee 'left_knee' must bend by 0.6 rad or more .* in its range, 0.00 to 0.23 rad, it bends "
+        "forwards from 0.10 to 0.33 rad only$",
+    ),
+    "knees that are always bent": (
+        both_knees(1.0, 1.4),
+        "the knee 'left_knee' must bend by 0.6 rad or more .* it bends forwards from 1.10 to 1.50 rad only$",
+    ),
+    "faces along -x": (
+        FACES_BACKWARDS,
+        "left_leg must be on the left side, where y is positive, and right_leg on the right, got ankles at "
+        "y = -0.070 and 0.070 m, and knees that bend backwards: turn the trunk so that it faces along x$",
+    ),
+    "faces along -x with knees that bend both ways": (
+        [*FACES_BACKWARDS, *both_knees(-2.2, 2.2)],
+        "ankles at y = -0.070 and 0.070 m: exchange the legs, or turn the trunk so that it faces along x$",
     ),
     "a leg that reaches nothing": (
         [
@@ -267,7 +294,7 @@ ARGUMENTS = {
         {"left_leg": RIGHT, "right_leg": LEFT, "feet": SPEC["feet"][::-1]},
         "left_leg must be on the left side, where y is positive, and right_leg on the right, got "
         "ankles at y = "
-        "-0.070 and 0.070 m$",
+        "-0.070 and 0.070 m: exchange the legs$",
     ),
     "legs swapped, feet not": (
         {"left_leg": RIGHT, "right_leg": LEFT},
