@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import inspect
 import tomllib
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -24,8 +25,8 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
         path: The TOML file.
 
     Raises:
-        ValueError: If the file cannot be read, has a key that is unknown or missing, or the robot cannot be
-            made of it, see `humanoid_from_mjcf`.
+        ValueError: If the file cannot be read, has a key that is unknown, missing or in a table, or the robot
+            cannot be made of it, see `humanoid_from_mjcf`.
     """
     # MuJoCo is imported only where a robot is read.
     from creps_jax.robots.mjcf import humanoid_from_mjcf
@@ -38,6 +39,7 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
     for key in values:
         if key not in known:
             raise UserError(f"{path} has an unknown key {key!r}{suggest(key, known)}")
+    _check_no_table_has_a_key(path, values, known)
     required = ["model", *(n for n, p in parameters.items() if p.default is p.empty and n != "path")]
     if missing := [key for key in required if key not in values]:
         raise UserError(f"{path} must have the keys {', '.join(required)}; missing: {', '.join(missing)}")
@@ -47,6 +49,16 @@ def humanoid_from_toml(path: Path | str) -> Humanoid:
         return humanoid_from_mjcf(model, **values)
     except ValueError as error:
         raise UserError(f"{path}: {error}") from error
+
+
+def _check_no_table_has_a_key(path: Path, values: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Check that no key of the description is in a table: in TOML, the lines below `[held]` belong to it."""
+    tables = {name: value for name, value in values.items() if isinstance(value, Mapping)}
+    for table, entries in tables.items():
+        if late := [key for key in entries if key in known and key not in values]:
+            raise UserError(
+                f"{path} must have its keys before its tables, got {', '.join(late)} in the table [{table}]"
+            )
 
 
 def model_file(path: Path) -> Path:
@@ -60,9 +72,12 @@ def model_file(path: Path) -> Path:
 
 def _described(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        # Some editors begin a file with a byte order mark.
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError) as error:
-        raise UserError(f"the robot must be described by a TOML file, cannot read {path}: {error}") from error
+        # The text of an OSError has the path again.
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"the robot must be described by a TOML file, cannot read {path}: {why}") from error
 
 
 def _model_path(spec: Path, model: Any) -> Path:

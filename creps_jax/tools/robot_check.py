@@ -29,6 +29,8 @@ _PARAMETERS = {
 }
 _BALANCE = Balance(0.3, 0.6, 0.06, 0.25)
 _SECONDS = 5.0
+# Share of the gaits below which learning may fail.
+_FEW = 1.0 / 3.0
 
 
 class Trial(NamedTuple):
@@ -118,13 +120,11 @@ def try_standard_gaits(ranges: RobotRanges, *, seed: int = 0) -> list[Trial]:
 
 
 def summary(trials: list[Trial]) -> str:
-    """Return how many gaits stay up, and what to do if none does."""
+    """Return how many gaits stay up, and what to do if few or none do."""
     up = sum(trial.seconds is None for trial in trials)
     text = f"{up} of {len(trials)} standard gaits stay up"
-    if up:
+    if up >= _FEW * len(trials):
         return text
-    longest = max(trial.seconds or 0.0 for trial in trials)
-    return (
-        f"{text}, the longest for {longest:.1f} s: learning may fail; compare kp, kv and foot_spacing with "
-        "other robots in models/humanoids"
-    )
+    if not up:
+        text += f", the longest for {max(trial.seconds or 0.0 for trial in trials):.1f} s"
+    return f"{text}: learning may fail; compare kp, kv and foot_spacing with other robots in models/humanoids"

@@ -524,11 +524,14 @@ def test_names_may_be_any(tmp_path):
     assert "Links/knee" in robot.joint_names and "R knee" in robot.joint_names
 
 
-def test_a_robot_is_read_from_toml(tmp_path):
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_a_robot_is_read_from_toml(encoding, tmp_path):
     write_model(tmp_path)
     spec = tmp_path / "walker.toml"
     keys = "".join(f"{key} = {values}\n" for key, values in SPEC.items())
-    spec.write_text(f'model = "small.xml"\n{keys}kp = 90\nspeeds = [0.1, 0.3]\n[held]\nhead = 1\n')
+    spec.write_text(
+        f'model = "small.xml"\n{keys}kp = 90\nspeeds = [0.1, 0.3]\n[held]\nhead = 1\n', encoding=encoding
+    )
     robot = humanoid_from_toml(spec)
     assert robot.name == "walker" and robot.speeds == (0.1, 0.3)
     assert robot.posture[joint(robot, "head")] == 1.0

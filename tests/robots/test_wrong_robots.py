@@ -255,6 +255,10 @@ MODELS = {
     ),
     "no mass at all": (
         [('type="sphere" size="0.04" mass="0.3"', 'type="sphere" size="0.04" mass="0"')],
+        "small.xml must compile: .*mass and inertia of moving bodies",
+    ),
+    "no mass but a mesh": (
+        [('type="sphere" size="0.04" mass="0.3"', 'type="mesh" mesh="foot" mass="0"')],
         "small.xml must compile without its meshes: .*mass and inertia of moving bodies",
     ),
 }
@@ -571,6 +575,22 @@ TOMLS = {
     ),
     "empty": ("", "must have the keys model, left_leg, right_leg, feet; missing: model, left_leg"),
     "key twice": (TOML + "kp = 1\nkp = 2", "cannot read .*small.toml: "),
+    "key in a table": (
+        TOML + "[held]\nhead = 0.1\nkp = 90\nspeeds = [0.1, 0.3]",
+        r"small.toml must have its keys before its tables, got kp, speeds in the table \[held\]$",
+    ),
+    "key in another table": (
+        TOML + "[arm_swing]\nkv = 9",
+        r"small.toml must have its keys before its tables, got kv in the table \[arm_swing\]$",
+    ),
+    "table in a table": (
+        TOML + "[max_speed]\nhead = 3\n[max_speed.held]\nhead = 0.1",
+        r"must have its keys before its tables, got held in the table \[max_speed\]$",
+    ),
+    "all keys in a table": (
+        "[held]\n" + TOML,
+        r"must have its keys before its tables, got model, left_leg, right_leg, feet in the table \[held\]$",
+    ),
     "model 3": (
         TOML.replace('"small.xml"', "3"),
         "model in .*small.toml must be a path, or package:path, got 3$",
@@ -627,7 +647,10 @@ def test_a_wrong_description_is_named(wrong, tmp_path):
 
 def test_a_description_must_be_a_file(tmp_path):
     for path in (tmp_path, tmp_path / "no.toml", str(tmp_path / "no.toml")):
-        with pytest.raises(UserError, match="must be described by a TOML file, cannot read"):
+        with pytest.raises(UserError, match="must be described by a TOML file, cannot read") as caught:
             spec.humanoid_from_toml(path)
+        message = str(caught.value)
+        assert message.count(str(path)) == 1 and "Errno" not in message
+    assert message.endswith("no.toml: No such file or directory")
     with pytest.raises(ValueError, match="path must be of type str or Path, got 3"):
         spec.humanoid_from_toml(3)
