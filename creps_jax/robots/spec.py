@@ -12,7 +12,7 @@ from creps_jax import checks
 from creps_jax.errors import UserError, suggest
 from creps_jax.robots.humanoid import Humanoid
 
-__all__ = ["humanoid_from_toml", "model_file"]
+__all__ = ["humanoid_from_toml"]
 
 
 def humanoid_from_toml(path: Path | str) -> Humanoid:
