@@ -21,6 +21,7 @@ from .search.creps import Creps, CrepsInfo, CrepsState, creps
 from .search.dual import DualSolution, sample_weights, solve_dual
 from .search.fit import bounded_ml, weighted_ml
 from .search.importance import Importance
+from .search.surrogate import Surrogate, SurrogateInfo, SurrogateState, surrogate
 from .tasks.base import Outcome, PlainOutcome, Task, average_repeats, penalised, sigmoid_constrained
 from .tasks.planar_arm import hole_reaching, via_point_reaching
 from .tasks.sine import sinus
@@ -52,6 +53,9 @@ __all__ = [
     "Policy",
     "Search",
     "Space",
+    "Surrogate",
+    "SurrogateInfo",
+    "SurrogateState",
     "Task",
     "Walker",
     "WeightedSamples",
@@ -93,6 +97,7 @@ __all__ = [
     "sinus",
     "solve_dual",
     "start_policy",
+    "surrogate",
     "tasks",
     "thomas_solve",
     "train",

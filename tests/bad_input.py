@@ -631,6 +631,19 @@ ROWS = {
         m_step=function(weighted_ml),
         importance=optional(record(cj.Importance(3, 2.0))),
     ),
+    "surrogate": row(
+        cj.surrogate,
+        use=lambda search: jax.eval_shape(
+            lambda: search.tell(search.init(POLICY), cj.Batch(CONTEXTS, THETAS, REWARDS))[0].policy
+        ),
+        policy_features=features(),
+        baseline_features=features(),
+        kl_bound=number(0.5, above=0.0),
+        archive_size=count(8),
+        ridge=number(1e-4, least=0.0),
+        m_step=function(weighted_ml),
+        gate=number(0.8, above=0.0),
+    ),
     "creps.init": row(ALGORITHM.init, policy=policy()),
     "creps.ask": row(ALGORITHM.ask, key=key(KEY), state=state(), contexts=array(CONTEXTS, free=(0,))),
     "creps.mean": row(ALGORITHM.mean, policy=policy(), contexts=array(CONTEXTS, free=(0,))),

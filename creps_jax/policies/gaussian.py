@@ -32,6 +32,7 @@ __all__ = [
     "mean",
     "sample",
     "start_policy",
+    "whitened",
 ]
 
 _LOG_TWO_PI = 1.8378770664093453
@@ -235,7 +236,7 @@ def linear_gaussian(features: FeatureMap, *, m_step: MStep, ridge: float | int =
         entropy=entropy,
         fit=_Fit(m_step, ridge, features.scale, features.constant),
         blend=_blend,
-        noise=_whitened,
+        noise=whitened,
         checked=checked,
     )
 
@@ -275,9 +276,9 @@ def _sample_rows(key: PRNGKey, policy: LinearGaussian, features: Array) -> Array
 
 
 def _log_prob_rows(policy: LinearGaussian, features: Array, theta: Array) -> Array:
-    whitened = _whitened(policy, features, theta)
+    noise = whitened(policy, features, theta)
     constant = _half_log_det(policy) + 0.5 * _LOG_TWO_PI * theta.shape[1]
-    return -0.5 * jnp.sum(whitened**2, axis=1) - constant
+    return -0.5 * jnp.sum(noise**2, axis=1) - constant
 
 
 def _kl_rows(policy: LinearGaussian, reference: LinearGaussian, features: Array) -> Array:
@@ -287,7 +288,7 @@ def _kl_rows(policy: LinearGaussian, reference: LinearGaussian, features: Array)
     return without_shift + 0.5 * jnp.sum(shifts**2, axis=1)
 
 
-def _whitened(policy: LinearGaussian, features: Array, theta: Array) -> Array:
+def whitened(policy: LinearGaussian, features: Array, theta: Array) -> Array:
     """Return the differences of theta from the mean, in units of the root of the covariance."""
     # One small inverse and a product: a triangular system for each sample takes many times as long.
     inverse = divided(jnp.eye(theta.shape[1], dtype=theta.dtype), policy.cov_chol.T)

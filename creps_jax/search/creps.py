@@ -294,10 +294,10 @@ def _algorithm(settings: CrepsSettings) -> Creps:
     """Return the functions of this module with these settings."""
     # Now, while an algorithm may be alive that shares the programs, such as the one that this one replaces.
     _ = settings.programs
-    return Creps(*(_with_settings(settings, function) for function in (init, ask, tell, policy, mean)))
+    return Creps(*(with_settings(settings, function) for function in (init, ask, tell, policy, mean)))
 
 
-def _with_settings(settings: CrepsSettings, function: Callable) -> Callable:
+def with_settings(settings: CrepsSettings, function: Callable) -> Callable:
     """Return a function of this module with its first argument, and with its docstring for `help`."""
     given = partial(function, settings)
     given.__doc__ = function.__doc__
@@ -305,6 +305,6 @@ def _with_settings(settings: CrepsSettings, function: Callable) -> Callable:
 
 
 def _settings_of(function: Callable) -> CrepsSettings | None:
-    """Return the settings that `_with_settings` has given to a function; None for any other function."""
+    """Return the settings that `with_settings` has given to a function; None for any other function."""
     is_own = isinstance(function, partial) and function.func in (init, ask, tell, policy, mean)
     return function.args[0] if is_own else None

@@ -22,7 +22,7 @@ from creps_jax.policies.gaussian import LinearGaussian, fit_weighted_ml
 from creps_jax.policies.regression import Regression, as_coefficients, coordinates, normaliser, regress
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["bounded_ml", "fit_within", "weighted_ml"]
+__all__ = ["as_cov_chol", "bounded_ml", "fit_within", "least_multiplier", "weighted_ml"]
 
 _LOG_MULTIPLIERS = (-12.0, 40.0)
 """Range of the logarithm of a multiplier: at the lower end it has no effect, at the upper nothing moves."""
@@ -142,7 +142,7 @@ class BoundedML:
         residual = divided(residual, old_chol.T)
         scatter = exact_dot(residual.T, residual) / unbiased  # Eq. 15
         factor = _bounded_factor(scatter, self.cov_kl_bound, self.entropy_loss_bound)
-        cov_chol = fit.size[:, None] * _as_cov_chol(exact_dot(old_chol, factor), old_chol)
+        cov_chol = fit.size[:, None] * as_cov_chol(exact_dot(old_chol, factor), old_chol)
         cov_chol = jnp.where(jnp.any(fit.weights > 0), cov_chol, policy.cov_chol)
         return LinearGaussian(policy.coef + as_coefficients(fit.basis, change, fit.size), cov_chol)
 
@@ -174,7 +174,7 @@ def _bounded_change(
     def kl(multiplier: Array) -> Array:
         return jnp.sum(share(multiplier) ** 2 * squares)
 
-    multiplier = _least_multiplier(kl, kl_bound, way.dtype)
+    multiplier = least_multiplier(kl, kl_bound, way.dtype)
     moved = exact_dot(axes, share(multiplier)[:, None] * way)
     moved = exact_dot(jax.scipy.linalg.solve_triangular(basis, moved), old_chol.T)
     # Mean and residuals are linear in theta: the part of the scatter of theta that the mean has used.
@@ -212,19 +212,19 @@ def _bounded_factor(
             y = change(kl_multiplier, entropy_multiplier)
             return 0.5 * jnp.sum(y - jnp.log1p(y))
 
-        return change(_least_multiplier(kl, kl_bound, excess.dtype), entropy_multiplier)
+        return change(least_multiplier(kl, kl_bound, excess.dtype), entropy_multiplier)
 
     def entropy_loss(entropy_multiplier: Array) -> Array:
         return -0.5 * jnp.sum(jnp.log1p(change_within_kl(entropy_multiplier)))
 
     entropy_multiplier = jnp.zeros((), excess.dtype)
     if entropy_loss_bound is not None:
-        entropy_multiplier = _least_multiplier(entropy_loss, entropy_loss_bound, excess.dtype)
+        entropy_multiplier = least_multiplier(entropy_loss, entropy_loss_bound, excess.dtype)
     x = 1.0 + change_within_kl(entropy_multiplier)
     return axes * jnp.sqrt(x)[None, :]
 
 
-def _as_cov_chol(root: Float[Array, "d d"], old_chol: Float[Array, "d d"]) -> Float[Array, "d d"]:
+def as_cov_chol(root: Float[Array, "d d"], old_chol: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """Return the Cholesky factor of a covariance with this square root, for parameters of size one."""
     upper = jnp.linalg.qr(root.T, mode="r")
     cov_chol = upper.T * jnp.where(jnp.diagonal(upper) < 0, -1.0, 1.0)[None, :]
@@ -234,7 +234,7 @@ def _as_cov_chol(root: Float[Array, "d d"], old_chol: Float[Array, "d d"]) -> Fl
     return cov_chol * jnp.maximum(least / jnp.linalg.norm(cov_chol, axis=1), 1.0)[:, None]
 
 
-def _least_multiplier(move: Callable[[Array], Scalar], bound: float, dtype: jnp.dtype) -> Array:
+def least_multiplier(move: Callable[[Array], Scalar], bound: ScalarLike, dtype: jnp.dtype) -> Array:
     """Return the least multiplier for which `move`, which falls with it, is within the bound."""
     low, high = (jnp.asarray(end, dtype) for end in _LOG_MULTIPLIERS)
     shares = jnp.linspace(0.0, 1.0, _NUM_TRIALS + 1, dtype=dtype)

@@ -19,7 +19,17 @@ from creps_jax.search.settings import CrepsSettings
 from creps_jax.search.weights import effective_samples, relative_entropy
 from creps_jax.typing import Array, Bool, Float, IntScalar, PRNGKey, Scalar, ScalarLike
 
-__all__ = ["CrepsInfo", "CrepsState", "mean_thetas", "sample_thetas", "update"]
+__all__ = [
+    "CrepsInfo",
+    "CrepsState",
+    "are_finite",
+    "features_of",
+    "is_usable",
+    "mean_over",
+    "mean_thetas",
+    "sample_thetas",
+    "update",
+]
 
 
 class CrepsState(NamedTuple):
@@ -101,7 +111,7 @@ def update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) -> 
 
     num_valid = jnp.sum(is_valid, dtype=jnp.int32)
     num_fitted = features.shape[1] + theta.shape[1]
-    is_updated = _is_usable(kind, fitted) & (num_valid >= num_fitted) & dual.is_informative
+    is_updated = is_usable(kind, fitted) & (num_valid >= num_fitted) & dual.is_informative
     policy = jax.tree.map(lambda new, old: jnp.where(is_updated, new, old), fitted, old)
     entropy = kind.entropy(policy)
     loss = jnp.maximum(kind.entropy(old) - entropy, 0.0)
@@ -109,7 +119,7 @@ def update(settings: CrepsSettings, kl_bound: ScalarLike, state: CrepsState) -> 
     info = CrepsInfo(
         dual=dual,
         kl=relative_entropy(weights, prior),
-        policy_kl=jnp.where(is_updated, _mean_over(kind.kl(policy, old, features), is_valid), 0.0),
+        policy_kl=jnp.where(is_updated, mean_over(kind.kl(policy, old, features), is_valid), 0.0),
         effective_samples=effective_samples(weights),
         prior_effective_samples=effective_samples(prior),
         entropy=entropy,
@@ -126,9 +136,9 @@ def _samples(settings: CrepsSettings, state: CrepsState) -> tuple[_Samples, Any]
     """Return the samples of an update, and the history with the policy of this iteration."""
     archive = state.archive
     context, theta, _ = archive.batch
-    features = _features_of("policy_features", settings.kind.features, context)
-    baseline = _features_of("baseline_features", settings.baseline_features, context)
-    is_valid = archive.is_valid & _are_finite(features) & _are_finite(baseline)
+    features = features_of("policy_features", settings.kind.features, context)
+    baseline = features_of("baseline_features", settings.baseline_features, context)
+    is_valid = archive.is_valid & are_finite(features) & are_finite(baseline)
     if settings.importance is not None:
         is_valid = is_valid & (archive.age < settings.importance.num_policies)
     archive = archive._replace(is_valid=is_valid)
@@ -171,13 +181,15 @@ def _share_by_chance(p_value: Scalar, significance: float | int | None) -> Scala
     return 2.0 * p_value if significance is None else 3.0 * jnp.minimum(p_value / significance, 1.0)
 
 
-def _is_usable(kind: Policy, policy: Any) -> Bool[Array, ""]:
+def is_usable(kind: Policy, policy: Any) -> Bool[Array, ""]:
+    """Return whether all numbers of a policy are finite, and its spread is positive."""
     # The entropy of a Gaussian is not finite unless its spread is positive.
     leaves = [*jax.tree.leaves(policy), kind.entropy(policy)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
 
 
-def _mean_over(values: Array, is_valid: Array) -> Scalar:
+def mean_over(values: Array, is_valid: Array) -> Scalar:
+    """Return the mean of the valid values; zero if there are none."""
     count = jnp.maximum(jnp.sum(is_valid, dtype=values.dtype), 1.0)
     return jnp.sum(values, where=is_valid) / count
 
@@ -186,19 +198,19 @@ def sample_thetas(
     settings: CrepsSettings, key: PRNGKey, policy: Any, contexts: Array
 ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
     """Draw parameters for contexts (n, s), and return for which of them the features are finite."""
-    features = _features_of("policy_features", settings.kind.features, contexts)
-    return settings.kind.sample(key, policy, features), _are_finite(features)
+    features = features_of("policy_features", settings.kind.features, contexts)
+    return settings.kind.sample(key, policy, features), are_finite(features)
 
 
 def mean_thetas(
     settings: CrepsSettings, policy: Any, contexts: Array
 ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
     """Return the mean parameters for contexts (n, s), and for which of them the features are finite."""
-    features = _features_of("policy_features", settings.kind.features, contexts)
-    return settings.kind.mean(policy, features), _are_finite(features)
+    features = features_of("policy_features", settings.kind.features, contexts)
+    return settings.kind.mean(policy, features), are_finite(features)
 
 
-def _features_of(name: str, features: FeatureMap, contexts: Array) -> Array:
+def features_of(name: str, features: FeatureMap, contexts: Array) -> Array:
     """Return the features of contexts (n, s), a row each, in the precision of the contexts."""
 
     def apply(context: Array) -> Array:
@@ -208,5 +220,6 @@ def _features_of(name: str, features: FeatureMap, contexts: Array) -> Array:
     return jax.vmap(apply)(contexts)
 
 
-def _are_finite(rows: Array) -> Bool[Array, " n"]:
+def are_finite(rows: Array) -> Bool[Array, " n"]:
+    """Return which rows are finite."""
     return jnp.all(jnp.isfinite(rows), axis=1)
