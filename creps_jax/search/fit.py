@@ -22,7 +22,7 @@ from creps_jax.policies.gaussian import LinearGaussian, fit_weighted_ml
 from creps_jax.policies.regression import Regression, as_coefficients, coordinates, normaliser, regress
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
-__all__ = ["as_cov_chol", "bounded_ml", "fit_within", "least_multiplier", "weighted_ml"]
+__all__ = ["bounded_ml", "fit_within", "weighted_ml"]
 
 _LOG_MULTIPLIERS = (-12.0, 40.0)
 """Range of the logarithm of a multiplier: at the lower end it has no effect, at the upper nothing moves."""

@@ -145,7 +145,8 @@ def whitener(columns: Float[Array, "n p"], is_used: Bool[Array, " n"]) -> Float[
     columns = columns * unit[None, :]
     squares, axes = jnp.linalg.eigh(exact_dot(columns.T, columns) / num)
     is_spread = squares > 32.0 * columns.shape[1] * jnp.finfo(columns.dtype).eps
-    scale = jnp.where(is_spread, jnp.where(is_spread, squares, 1.0) ** -0.5, 0.0)
+    tiny = jnp.finfo(columns.dtype).tiny
+    scale = jnp.where(is_spread, 1.0 / jnp.sqrt(jnp.maximum(squares, tiny)), 0.0)
     return unit[:, None] * axes * scale[None, :]
 
 
