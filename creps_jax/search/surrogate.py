@@ -86,9 +86,9 @@ def surrogate(
     the last samples, and to older ones that the policy could still have drawn. Rewards far below the others
     (falls) and samples far from the model are left out. The mean moves to the maximum of the model within
     `kl_bound`, the covariance towards the inverse of its curvature within a smaller bound. While steps go in
-    one direction the spread grows, otherwise it shrinks. Where rewards are smooth the search needs a tenth of
-    the episodes of contextual REPS or fewer. Elsewhere, if the model explains less than `gate`, the update is
-    that of `creps` with `bounded_ml()`.
+    one direction the spread grows, otherwise it shrinks. On quadratics the search needs 6 to 23 % of the
+    episodes of contextual REPS with `bounded_ml()`, on their roots half of them. If the model explains less
+    than `gate`, the update is that of contextual REPS.
 
     Args:
         policy_features: Features varphi(s) that the mean of the Gaussian policy is linear in.
