@@ -39,8 +39,8 @@ class Quadratic(NamedTuple):
     """Share of the variance, beyond that of the context, that the model explains in cross-validation."""
     num_used: IntScalar
     """Number of samples that were fitted."""
-    num_left_out: IntScalar
-    """Number of samples that were left out, because they are far from the median or from the model."""
+    is_left_out: Bool[Array, " n"]
+    """Whether a sample was left out, because it is far from the median or from the model."""
 
 
 class _Ridge(NamedTuple):
@@ -123,13 +123,12 @@ def fit_quadratic(
         rows, cols = np.triu_indices(dim, 1)
         products = jnp.zeros_like(curvature).at[rows, cols].set(found.coef[second:])
         curvature = curvature + products + products.T
-    num_kept = jnp.sum(kept, dtype=jnp.int32)
     return Quadratic(
         found.coef[:first].reshape(dim, num_features),
         curvature,
         found.r2,
-        num_kept,
-        jnp.sum(is_used, dtype=jnp.int32) - num_kept,
+        jnp.sum(kept, dtype=jnp.int32),
+        is_used & ~kept,
     )
 
 

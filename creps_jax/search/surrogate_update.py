@@ -12,6 +12,7 @@ from creps_jax.numerics.linalg import exact_dot
 from creps_jax.policies.gaussian import LinearGaussian, whitened
 from creps_jax.search.archive import Archive, centred_reward
 from creps_jax.search.dual import DualSolution
+from creps_jax.search.evidence import independence_p_value
 from creps_jax.search.settings import CrepsSettings
 from creps_jax.search.surrogate_fit import Quadratic, fit_quadratic, num_unknowns, whitener
 from creps_jax.search.surrogate_step import Step, path_decay, step
@@ -30,10 +31,10 @@ _MOST_COLUMNS = 600
 """Largest number of coefficients; beyond it the curvature is diagonal."""
 _BOUNDED_SAMPLES = 10
 """Number of samples for each feature and parameter that the bounded fit uses."""
-_MANY_LEFT_OUT = 0.05
-"""Share of samples left out from which on rewards are taken to jump."""
-_CLOSER = 0.95
-"""How much nearer to one the gate is then."""
+_MANY_LEFT_OUT = 0.03
+"""Share of samples left out from which on they must not depend on the parameters."""
+_BY_CHANCE = 0.01
+"""Least p-value at which they count as independent."""
 _TOO_MANY_LEFT_OUT = 0.2
 """Share of samples left out from which on the model is not used."""
 _SAMPLES_OF_SLOPE = 2
@@ -98,9 +99,10 @@ def surrogate_update(
     policy, archive, _, path = state
     num_baseline = settings.baseline_features.size
     fallback, info = lax.optimization_barrier(_bounded_update(settings, kl_bound, state))
-    model, moved, features, is_valid = _modelled(settings, kl_bound, state)
+    model, moved, features, is_valid, is_smooth = _modelled(settings, kl_bound, state)
     is_good = (
-        (model.r2 >= _gate(settings.gate, model))
+        (model.r2 >= settings.gate)
+        & is_smooth
         & is_usable(settings.kind, moved.policy)
         & jnp.all(jnp.isfinite(moved.path))
         & info.dual.is_informative
@@ -121,7 +123,7 @@ def surrogate_update(
         is_by_model=is_good,
         model_r2=model.r2,
         num_fitted=model.num_used,
-        num_left_out=model.num_left_out,
+        num_left_out=jnp.sum(model.is_left_out, dtype=jnp.int32),
     )
     path = jnp.where(is_good, moved.path, rest)
     return SurrogateState(chosen, archive, state.iteration + 1, path), info
@@ -132,7 +134,8 @@ def _bounded_update(
 ) -> tuple[Any, Any]:
     """Return the policy and the diagnostics of contextual REPS, on as many of the last samples as suit it."""
     size, dim = state.archive.batch.theta.shape
-    num = min(_BOUNDED_SAMPLES * (settings.kind.features.size + dim), size)
+    num_fitted = max(settings.kind.features.size + dim, settings.baseline_features.size)
+    num = min(_BOUNDED_SAMPLES * num_fitted, size)
     archive = state.archive._replace(is_valid=state.archive.is_valid & (_recency(state.archive) < num))
     creps_state = CrepsState(state.policy, archive, state.iteration)
     following, info = update(settings, kl_bound, creps_state)
@@ -141,8 +144,12 @@ def _bounded_update(
 
 def _modelled(
     settings: SurrogateSettings, kl_bound: ScalarLike, state: SurrogateState
-) -> tuple[Quadratic, Step, Array, Array]:
-    """Fit the model and move by it; also return the policy features, and which samples are valid."""
+) -> tuple[Quadratic, Step, Array, Array, Array]:
+    """Fit the model and move by it.
+
+    Returns:
+        The model, the step, the policy features, which samples are valid, and whether rewards are smooth.
+    """
     policy, archive, _, path = state
     context, theta, _ = archive.batch
     features = features_of("policy_features", settings.kind.features, context)
@@ -157,10 +164,11 @@ def _modelled(
     is_near = jnp.mean(z**2, axis=1) <= _NEAR
     is_used = is_valid & (recent | is_near)
     whitening = whitener(features, is_used)
+    white = exact_dot(features, whitening)
     reward, _ = centred_reward(archive._replace(is_valid=is_valid))
     model = fit_quadratic(
         z,
-        exact_dot(features, whitening),
+        white,
         columns,
         reward,
         is_used,
@@ -170,7 +178,7 @@ def _modelled(
     theta_size = jnp.where(theta_size > 0, theta_size, 1.0)
     shown = jnp.where(is_used[:, None], features, 0.0)
     moved = step(policy, model, path, shown, whitening, theta_size, kl_bound=kl_bound)
-    return model, moved, features, is_valid
+    return model, moved, features, is_valid, _is_smooth(model, is_used, white, z)
 
 
 def context_columns(baseline: Float[Array, "n m"]) -> Float[Array, "n q"]:
@@ -200,10 +208,10 @@ def _recency(archive: Archive) -> Array:
     return (archive.next_index - 1 - jnp.arange(size, dtype=jnp.int32)) % size
 
 
-def _gate(given: float, model: Quadratic) -> Scalar:
-    """Return the least R2: higher where rewards jump, which shows by samples that the model leaves out."""
-    num = (model.num_used + model.num_left_out).astype(model.r2.dtype)
-    left_out = model.num_left_out.astype(num.dtype)
-    gate = jnp.asarray(given, num.dtype)
-    gate = jnp.where(left_out > _MANY_LEFT_OUT * num, gate + _CLOSER * (1.0 - gate), gate)
-    return jnp.where(left_out > _TOO_MANY_LEFT_OUT * num, jnp.inf, gate)
+def _is_smooth(model: Quadratic, is_used: Array, features: Array, z: Array) -> Array:
+    """Return whether samples are left out by chance, as falls are: rewards that jump depend on parameters."""
+    used, left_out = is_used.astype(z.dtype), model.is_left_out.astype(z.dtype)
+    num, num_left_out = jnp.sum(used), jnp.sum(left_out)
+    p_value = independence_p_value(left_out / jnp.maximum(num_left_out, 1.0), used, features, z)
+    is_by_chance = (num_left_out <= _MANY_LEFT_OUT * num) | (p_value >= _BY_CHANCE)
+    return is_by_chance & (num_left_out <= _TOO_MANY_LEFT_OUT * num)

@@ -116,6 +116,16 @@ def test_falls_are_left_out(key):
     assert log.info.num_left_out[-1] > 0 and log.info.is_by_model[-1]
 
 
+def test_the_model_is_not_used_where_falls_depend_on_the_parameters(key):
+    state = SEARCH.init(START)
+    batch = batch_of(key, state)
+    is_far = batch.theta[:, 0] > jnp.sort(batch.theta[:, 0])[-12]
+    for is_fall, is_by_model in ((is_far, False), (jax.random.permutation(key, is_far), True)):
+        _, info = SEARCH.tell(state, batch._replace(reward=jnp.where(is_fall, -1e4, batch.reward)))
+        assert 5 < info.num_left_out <= 11 and info.model_r2 > 0.9
+        assert bool(info.is_by_model) is is_by_model
+
+
 def test_trials_are_those_of_single_runs(key):
     keys = jax.random.split(key, 2)
     settings = {"iterations": 4, "samples": 40}
