@@ -105,8 +105,8 @@ def surrogate(
         m_step: Fit of the policy where the model is not used, `bounded_ml()` by default.
         significance: As in `creps`.
         gate: Least share of the variance of the rewards, beyond that by the context, that the model must
-            explain in cross-validation. Nor is the model used if it leaves out more than 20 % of the samples, or
-            more than 3 % that depend on the parameters: they are no falls by chance, but rewards that jump.
+            explain in cross-validation. Nor is the model used if it leaves out more than 20 % of the samples,
+            or more than 3 % and these depend on the parameters: rewards that jump, not falls by chance.
 
     Returns:
         The search, with the functions `init`, `ask`, `tell`, `policy` and `mean`. `tell` returns
