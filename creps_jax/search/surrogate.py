@@ -106,7 +106,7 @@ def surrogate(
         significance: As in `creps`.
         gate: Least share of the variance of the rewards, beyond that by the context, that the model must
             explain in cross-validation. Nor is the model used if it leaves out more than 20 % of the samples,
-            or more than 3 % and these depend on the parameters: rewards that jump, not falls by chance.
+            or more than 5 % and these depend on the parameters: rewards that jump, not falls by chance.
 
     Returns:
         The search, with the functions `init`, `ask`, `tell`, `policy` and `mean`. `tell` returns

@@ -31,7 +31,7 @@ _MOST_COLUMNS = 600
 """Largest number of coefficients; beyond it the curvature is diagonal."""
 _BOUNDED_SAMPLES = 10
 """Number of samples for each feature and parameter that the bounded fit uses."""
-_MANY_LEFT_OUT = 0.03
+_MANY_LEFT_OUT = 0.05
 """Share of samples left out from which on they must not depend on the parameters."""
 _BY_CHANCE = 0.01
 """Least p-value at which they count as independent."""
