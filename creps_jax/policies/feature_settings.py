@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FEATURE_KINDS", "Features"]
 
-FEATURE_KINDS = ("linear", "rbf")
+FEATURE_KINDS = ("linear", "polynomial", "rbf")
 """The kinds of features that `Features` can make."""
 
 
@@ -20,15 +20,18 @@ class Features:
     """Settings of features, for runs, sessions and files.
 
     Attributes:
-        kind: One of `FEATURE_KINDS`.
+        kind: One of `FEATURE_KINDS`. None is "polynomial" with a degree, "rbf" with a number of centres or a
+            bandwidth; without any of them, "rbf" for one or two variables and "polynomial" for more.
         num_centers: Number K of RBF centres: one for all context variables, or one for each; None is 5 for
             one variable, 3 along each of two, and 2 along each of more.
         bandwidth: Width of the RBFs in the units of the context; None is (high - low) / K.
+        degree: Largest sum of the exponents in a monomial of polynomial features; None is 2.
     """
 
-    kind: str = "rbf"
+    kind: str | None = None
     num_centers: int | tuple[int, ...] | None = None
     bandwidth: float | None = None
+    degree: int | None = None
 
     def __post_init__(self) -> None:
         # Settings are hashed.
@@ -36,8 +39,11 @@ class Features:
             object.__setattr__(self, "num_centers", tuple(self.num_centers))
 
     def complete(self, dim: int) -> "Features":
-        """Return the settings for a number of context variables, with the default number of centres."""
-        return dataclasses.replace(self, num_centers=self._centers(dim))
+        """Return the settings for a number of context variables, with the default kind and size."""
+        kind = self._kind(dim)
+        if kind == "polynomial":
+            return dataclasses.replace(self, kind=kind, degree=self._degree())
+        return dataclasses.replace(self, kind=kind, num_centers=self._centers(dim))
 
     def make(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
         """Return the features over a range of contexts: a number, or one for each context variable.
@@ -46,12 +52,16 @@ class Features:
             ValueError: If the kind is unknown, or a setting is out of its range.
         """
         # Settings are read by commands that do not start jax.
-        from creps_jax.policies.features import linear_features, rbf_features
+        from creps_jax.policies.features import linear_features, polynomial_features, rbf_features
 
-        if self.kind == "linear":
-            return linear_features(np.size(low))
-        if self.kind == "rbf":
-            return rbf_features(low, high, self._centers(np.size(low)), bandwidth=self.bandwidth)
+        dim = np.size(low)
+        kind = self._kind(dim)
+        if kind == "linear":
+            return linear_features(dim)
+        if kind == "polynomial":
+            return polynomial_features(dim, self._degree())
+        if kind == "rbf":
+            return rbf_features(low, high, self._centers(dim), bandwidth=self.bandwidth)
         raise ValueError(f"features must be one of {', '.join(FEATURE_KINDS)}, got {self.kind!r}")
 
     def make_baseline(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
@@ -64,6 +74,17 @@ class Features:
 
         features = self.make(low, high)
         return quadratic_features(features.context_dim) if self.kind == "linear" else features
+
+    def _kind(self, dim: int) -> str:
+        if self.kind is not None:
+            return self.kind
+        if self.degree is not None:
+            return "polynomial"
+        is_radial = dim <= 2 or self.num_centers is not None or self.bandwidth is not None
+        return "rbf" if is_radial else "polynomial"
+
+    def _degree(self) -> int:
+        return 2 if self.degree is None else self.degree
 
     def _centers(self, dim: int) -> int | tuple[int, ...]:
         return {1: 5, 2: 3}.get(dim, 2) if self.num_centers is None else self.num_centers

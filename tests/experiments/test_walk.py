@@ -254,7 +254,7 @@ def test_a_machine_without_opengl_only_lacks_the_video(bench, monkeypatch):
     assert "apt-get" in said[-1]
 
 
-@pytest.mark.parametrize("kind", ["linear", "rbf"])
+@pytest.mark.parametrize("kind", ["linear", "polynomial", "rbf"])
 def test_the_first_policy_is_the_same_for_every_speed(kind):
     settings = walk.Settings(features=Features(kind), start_mean=-0.5, low=0.1, high=0.6)
     policy = walk_learning.as_learned(settings, walk_learning.first_policy(settings))

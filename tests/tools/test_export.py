@@ -48,6 +48,8 @@ def make_policy(name: str, features: Features, constraint: str, *, num_contexts:
     scale = np.ones((features.make(low, high).size, 1))
     if features.kind == "linear":
         scale[1:, 0] = 1.0 / np.array(high)
+    if features.kind == "polynomial":
+        scale = 1.0 / np.abs(np.asarray(features.make(low, high)(jnp.array(high))))[:, None]
     coef = (2.0 * scale * rng.normal(size=(len(scale), 3))).astype(np.float32)
     return Learned(
         LinearGaussian(coef, np.eye(3, dtype=np.float32)),
@@ -66,6 +68,7 @@ POLICIES = {
         make_policy("lonely", Features("rbf", 1), "sigmoid", num_contexts=1),
         make_policy("straight", Features("linear"), "sigmoid"),
         make_policy("clipped", Features("linear"), "clip"),
+        make_policy("curved", Features("polynomial", degree=3), "sigmoid"),
         make_policy("free", Features("linear"), "none"),
         load(SHIPPED),
     )
@@ -226,7 +229,9 @@ def test_features_that_cannot_be_exported_are_named(make):
     contexts = Space(("speed",), (0.1,), (0.6,))
     features = quadratic_features(1)
     policy = LinearGaussian(np.zeros((2, 3)), np.eye(3))
-    with pytest.raises(UserError, match="features must be linear or rbf to be exported, got quadratic"):
+    with pytest.raises(
+        UserError, match="features must be linear, polynomial or rbf to be exported, got quadratic"
+    ):
         make(Learned(policy, features, contexts, POLICIES["free"].parameters))
 
 

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import errno
+import hashlib
 import json
 import math
 import os
@@ -30,7 +31,7 @@ from creps_jax.search.fit import bounded_ml
 from creps_jax.tools.cli import main
 from creps_jax.tools.session import RobotSession, page, plain, robot_session, storage
 from creps_jax.tools.session.learner import Update
-from creps_jax.tools.session.settings import load_settings
+from creps_jax.tools.session.settings import Settings, load_settings
 from creps_jax.tools.session.trials import Record, Trial
 
 ROOT = Path(__file__).parents[2]
@@ -428,7 +429,9 @@ def broken(*path, **values) -> dict:
         ),
         (broken("parameters", 0, spread=0.0), "spread of speed must be above zero, got 0"),
         (broken("parameters", 0, spread=1e-60), "in single precision: std must be above zero"),
-        (broken("features", kind="cubic"), "features must be one of linear, rbf, got 'cubic'"),
+        (broken("features", kind="cubic"), "features must be one of linear, polynomial, rbf, got 'cubic'"),
+        (broken("features", kind="polynomial", degree=0), "degree must be at least 1, got 0"),
+        (broken("features", degree=2.5), r"features\.degree must be a whole number, got 2\.5"),
         (broken("features", num_centers=0), "num_centers must be at least 1, got 0"),
         (broken("features", num_centers=2.5), r"features\.num_centers must be a whole number, got 2\.5"),
         (
@@ -439,7 +442,7 @@ def broken(*path, **values) -> dict:
         (broken("features", num_centers=[0]), r"num_centers must be whole numbers of at least 1, got \(0,\)"),
         (
             broken(features=3),
-            "features must be an object with the fields kind, num_centers, bandwidth, got 3",
+            "features must be an object with the fields kind, num_centers, bandwidth, degree, got 3",
         ),
         (broken(constraint="penalty"), "constraint must be one of sigmoid, clip, got 'penalty'"),
         (broken(kl_bound=0), "kl_bound must be above zero, got 0"),
@@ -531,7 +534,9 @@ def test_a_session_from_a_policy_begins_with_it(tmp_path):
     plain = RobotSession.create(tmp_path / "plain", policy=unbound)
     assert plain.settings.constraint == "clip"
     elsewhere = dataclasses.replace(policy, features=rbf_features(0.0, 3.0, 3))
-    with pytest.raises(UserError, match="a session must begin with linear features, or with RBFs over"):
+    with pytest.raises(
+        UserError, match="a session must begin with linear or polynomial features, or with RBFs over"
+    ):
         RobotSession.create(tmp_path / "other", policy=elsewhere)
     for exploration in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(UserError, match="exploration must be above zero and finite"):
@@ -641,12 +646,59 @@ def test_each_context_may_have_its_own_number_of_centres(tmp_path):
     assert again.policy().features == policy.features
 
 
-@pytest.mark.parametrize(
-    ("num_contexts", "num_centers", "archive_size"), [(1, 5, 50), (2, 3, 50), (3, 2, 50)]
-)
+@pytest.mark.parametrize(("num_contexts", "num_centers", "archive_size"), [(1, 5, 50), (2, 3, 50)])
 def test_more_contexts_have_fewer_centres_along_each(tmp_path, num_contexts, num_centers, archive_size):
     contexts = [{"name": f"c{i}", "low": 0.0, "high": 1.0} for i in range(num_contexts)]
     define = {"contexts": contexts, "parameters": [{"name": "x", "low": -5.0, "high": 5.0}]}
     settings = RobotSession.create(tmp_path / "arm", define=define).status().settings
     assert settings.features.num_centers == num_centers
     assert settings.archive_size == archive_size
+
+
+def define_with_three_contexts(**features) -> dict:
+    contexts = [{"name": f"c{i}", "low": -1.0, "high": 1.0} for i in range(3)]
+    parameters = [{"name": "x", "low": -5.0, "high": 5.0}]
+    return {"contexts": contexts, "parameters": parameters, "features": features, "batch_size": 20}
+
+
+@pytest.mark.parametrize(
+    ("features", "kind", "degree", "size"),
+    [
+        ({}, "polynomial", 2, 10),
+        ({"degree": 3}, "polynomial", 3, 20),
+        ({"kind": "polynomial"}, "polynomial", 2, 10),
+        ({"num_centers": 2}, "rbf", None, 8),
+        ({"kind": "rbf"}, "rbf", None, 8),
+    ],
+)
+def test_three_contexts_have_polynomial_features_by_default(tmp_path, features, kind, degree, size):
+    session = RobotSession.create(tmp_path / "arm", define=define_with_three_contexts(**features))
+    settings = RobotSession.open(tmp_path / "arm").settings
+    assert settings == session.settings
+    assert (settings.features.kind, settings.features.degree) == (kind, degree)
+    session.policy().save(tmp_path / "policy.npz")
+    policy = load(tmp_path / "policy.npz")
+    assert policy.features.size == size
+    again = RobotSession.create(tmp_path / "again", policy=policy)
+    assert again.policy().features == policy.features
+
+
+def test_a_session_with_three_contexts_learns(tmp_path):
+    session = RobotSession.create(tmp_path / "arm", define=define_with_three_contexts())
+    rewards = []
+    for _ in range(10):
+        trials = session.ask()
+        for trial in trials:
+            c = trial.context
+            reward = -((trial.parameters["x"] - 1 - c["c0"] * c["c1"] - c["c2"]) ** 2)
+            session.tell(trial.id, reward=reward)
+            rewards.append(reward)
+    assert np.mean(rewards[-40:]) > 0.5 * np.mean(rewards[:40])
+
+
+def test_settings_without_a_degree_have_the_digest_of_earlier_versions():
+    settings = plain.read(Settings, DEFINITION, "settings")
+    values = dataclasses.asdict(settings)
+    del values["features"]["degree"]
+    expected = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
+    assert settings.digest() == expected

@@ -21,6 +21,7 @@ from creps_jax.robots.mjcf import humanoid_from_mjcf
 from creps_jax.robots.nao_geometry import JOINT_NAMES
 from creps_jax.robots.robot import NAO, NAO_H25, Robot
 from creps_jax.tools.export import walk_c
+from creps_jax.tools.export.formula import formula_of
 from creps_jax.walking.gaits import learned_walker
 from creps_jax.walking.posture import Balance
 from experiments.benchmarks.exported_walk import (
@@ -59,9 +60,10 @@ def with_friction(policy):
         ),
         policy=policy.policy._replace(coef=jnp.zeros((features.size, policy.parameters.size))),
     )
-    before = dict(zip(walk_c.exponents(policy), np.asarray(policy.policy.coef), strict=True))
+    rows, wider_rows = (list(map(tuple, formula_of(each).exponents.tolist())) for each in (policy, wider))
+    before = dict(zip(rows, np.asarray(policy.policy.coef), strict=True))
     extra = np.full(policy.parameters.size, 0.05)
-    coef = [before.get(row[:-1], extra) if row[-1] == 0 else extra for row in walk_c.exponents(wider)]
+    coef = [before.get(row[:-1], extra) if row[-1] == 0 else extra for row in wider_rows]
     return dataclasses.replace(wider, policy=policy.policy._replace(coef=jnp.asarray(coef, jnp.float32)))
 
 

@@ -68,6 +68,18 @@ LINEAR = """\
     }
 """
 
+POLYNOMIAL = """\
+    for (i = 0; i < ${PREFIX}_NUM_FEATURES; ++i) {
+        features[i] = 1.0f;
+        for (j = 0; j < ${PREFIX}_NUM_CONTEXTS; ++j) {
+            int k;
+            for (k = 0; k < ${prefix}_exponents[i][j]; ++k) {
+                features[i] *= nearest[j];
+            }
+        }
+    }
+"""
+
 # The largest exponent is subtracted from all, so that the weights cannot all be zero.
 RBF = """\
     float largest = 0.0f, sum = 0.0f;

@@ -10,7 +10,7 @@ import numpy as np
 
 from creps_jax.files import package_version, save_text
 from creps_jax.policies.learned import Learned
-from creps_jax.tools.export.c_code import HEADER, HOLD_BOUNDS, LINEAR, RBF
+from creps_jax.tools.export.c_code import HEADER, HOLD_BOUNDS, LINEAR, POLYNOMIAL, RBF
 from creps_jax.tools.export.formula import Formula, formula_of
 
 # Characters that need no escape in a C string: not quotes, backslashes, nor "?", as "??" starts a trigraph.
@@ -34,7 +34,8 @@ def make_header(policy: Learned, name: str | None = None) -> str:
     formula = formula_of(policy)
     prefix = _prefix(str(policy.task.get("name", "")) if name is None else name)
     names = {"prefix": prefix, "PREFIX": prefix.upper()}
-    features = RBF if len(formula.centers) else LINEAR
+    is_linear = not len(formula.centers) and formula.exponents.max() == 1
+    features = RBF if len(formula.centers) else LINEAR if is_linear else POLYNOMIAL
     is_bounded = policy.parameters.constraint != "none"
     held = f", within {prefix}_parameter_low to {prefix}_parameter_high" if is_bounded else ""
     middle = 0.5 * (formula.context_low + formula.context_high)
@@ -74,6 +75,9 @@ def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
     if len(formula.centers):
         tables.append(floats(f"{prefix}_centers[{features}][{contexts}]", formula.centers))
         tables.append(floats(f"{prefix}_widths[{contexts}]", formula.widths))
+    elif formula.exponents.max() > 1:
+        rows = [f"{{{', '.join(map(str, row))}}}" for row in formula.exponents.tolist()]
+        tables.append(f"static const int {prefix}_exponents[{features}][{contexts}] = {{{_lines(rows)}}};\n")
     return "\n".join(tables)
 
 

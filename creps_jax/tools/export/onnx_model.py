@@ -35,9 +35,10 @@ def make_model(policy: Learned) -> onnx.ModelProto:
         UserError: if a number of the policy is too large for single precision.
     """
     kind = describe(policy.features)["kind"]
+    formula = formula_of(policy)
     nodes = [*_clamp(), *_mean(kind), *_hold_bounds(policy.parameters.constraint)]
     used = {name for node in nodes for name in node.input}
-    constants = _constants(formula_of(policy))
+    constants = _constants(formula)
     tensors = [numpy_helper.from_array(values, name) for name, values in constants.items() if name in used]
     contexts, params = ", ".join(policy.contexts.names), ", ".join(policy.parameters.names)
     value = helper.make_tensor_value_info
@@ -80,6 +81,13 @@ def _mean(kind: str) -> list[onnx.NodeProto]:
         return [
             _node("rise", "MatMul", "nearest", "slope"),
             _node("mean", "Add", "rise", "intercept"),
+        ]
+    if kind == "polynomial":
+        return [
+            _node("row", "Unsqueeze", "nearest", "middle_axis"),
+            _node("powers", "Pow", "row", "exponents"),
+            _node("features", "ReduceProd", "powers", axes=[2], keepdims=0),
+            _node("mean", "MatMul", "features", "coef"),
         ]
     return [
         _node("row", "Unsqueeze", "nearest", "middle_axis"),

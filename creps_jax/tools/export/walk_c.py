@@ -1,6 +1,5 @@
 """Write a whole walk as C: policy, planner, kinematics and feedback, for robots without Python."""
 
-import itertools
 import re
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -11,7 +10,6 @@ import numpy as np
 from creps_jax.errors import UserError
 from creps_jax.files import package_version, save_text
 from creps_jax.policies.bounds import SIGMOID
-from creps_jax.policies.features import describe
 from creps_jax.policies.learned import Learned
 from creps_jax.robots import legs, screw_kinematics
 from creps_jax.robots.humanoid import Humanoid
@@ -23,8 +21,6 @@ from creps_jax.typing import ScalarLike
 from creps_jax.walking import com_plan, controller, engine, footsteps, gaits, params, posture
 from creps_jax.walking.controller import Walker
 from creps_jax.walking.gaits import COMMAND_NAMES, command_range, is_steered, learned_walker
-
-_KINDS = ("linear", "polynomial", "rbf")
 
 
 def save(path: Path, policy: Learned, *, robot: Robot | None = None, period: float = 0.02) -> None:
@@ -216,7 +212,7 @@ def _chain_constants(robot: Humanoid) -> list[str]:
 
 
 def _policy_constants(policy: Learned) -> list[str]:
-    formula = formula_of(policy, _KINDS)
+    formula = formula_of(policy)
     num_features, num_contexts = len(formula.coef), len(formula.context_low)
     is_rbf = len(formula.centers) > 0
     lines = [
@@ -238,19 +234,8 @@ def _policy_constants(policy: Learned) -> list[str]:
             floats(f"CENTERS[{num_features}][{num_contexts}]", formula.centers),
             _vector("WIDTHS", formula.widths),
         ]
-    rows = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in exponents(policy))
+    rows = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in formula.exponents)
     return [*lines, f"static const int EXPONENTS[{num_features}][{num_contexts}] = {{{rows}}};"]
-
-
-def exponents(policy: Learned) -> list[tuple[int, ...]]:
-    """Return the exponent of each context variable in each of the linear or polynomial features."""
-    features = describe(policy.features)
-    dim, degree = features["dim"], features.get("degree", 1)
-    rows = []
-    for each in range(degree + 1):
-        for variables in itertools.combinations_with_replacement(range(dim), each):
-            rows.append(tuple(variables.count(variable) for variable in range(dim)))
-    return rows
 
 
 def _defined(numbers: Mapping[str, ScalarLike], counts: Mapping[str, int] | None = None) -> list[str]:

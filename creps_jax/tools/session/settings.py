@@ -150,7 +150,11 @@ class Settings:
 
     def digest(self) -> str:
         """Return a short text that differs from the text of other settings."""
-        text = json.dumps(dataclasses.asdict(self), sort_keys=True)
+        values = dataclasses.asdict(self)
+        # Sessions of earlier versions have no degree.
+        if self.features.degree is None:
+            del values["features"]["degree"]
+        text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

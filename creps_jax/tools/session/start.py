@@ -53,7 +53,9 @@ def _settings_of_features(learned: Learned) -> Features:
     low, high = learned.contexts.low, learned.contexts.high
     described = describe(learned.features)
     settings = Features("linear")
-    if described["kind"] == "rbf":
+    if described["kind"] == "polynomial":
+        settings = Features("polynomial", degree=described["degree"])
+    elif described["kind"] == "rbf":
         counts, widths = described["num_centers"], described["width"]
         num_centers = counts[0] if len(set(counts)) == 1 else tuple(counts)
         settings = Features("rbf", num_centers)
@@ -61,8 +63,8 @@ def _settings_of_features(learned: Learned) -> Features:
             settings = Features("rbf", num_centers, widths[0])
     if settings.make(low, high) != learned.features:
         raise UserError(
-            "a session must begin with linear features, or with RBFs over the range of the contexts that "
-            f"have the default width or one width, got {described}"
+            "a session must begin with linear or polynomial features, or with RBFs over the range of "
+            f"the contexts that have the default width or one width, got {described}"
         )
     return settings
 
