@@ -5,7 +5,7 @@ Functions take the features of one context; `jax.vmap` them over a batch.
 
 import dataclasses
 import inspect
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,15 +22,20 @@ from creps_jax.typing import Array, Float, PRNGKey, Scalar, ScalarLike, VectorLi
 
 __all__ = [
     "LinearGaussian",
+    "blend",
     "blended_cov_chol",
+    "check_cov_chol",
     "checked",
     "entropy",
     "fit_weighted_ml",
     "kl",
     "linear_gaussian",
     "log_prob",
+    "log_prob_rows",
     "mean",
+    "mean_rows",
     "sample",
+    "sample_rows",
     "start_policy",
     "whitened",
 ]
@@ -229,13 +234,13 @@ def linear_gaussian(features: FeatureMap, *, m_step: MStep, ridge: float | int =
     checks.function("m_step", m_step, "(policy, samples, *, ridge, scale, constant) -> policy")
     return Policy(
         features,
-        mean=_mean_rows,
-        sample=_sample_rows,
-        log_prob=_log_prob_rows,
+        mean=mean_rows,
+        sample=sample_rows,
+        log_prob=log_prob_rows,
         kl=_kl_rows,
         entropy=entropy,
         fit=_Fit(m_step, ridge, features.scale, features.constant),
-        blend=_blend,
+        blend=blend,
         noise=whitened,
         checked=checked,
     )
@@ -266,16 +271,19 @@ class _Fit:
         return fitted
 
 
-def _mean_rows(policy: LinearGaussian, features: Array) -> Array:
+def mean_rows(policy: LinearGaussian, features: Array) -> Array:
+    """Return the mean parameters for rows of features."""
     return jax.vmap(mean, (None, 0))(policy, features)
 
 
-def _sample_rows(key: PRNGKey, policy: LinearGaussian, features: Array) -> Array:
+def sample_rows(key: PRNGKey, policy: LinearGaussian, features: Array) -> Array:
+    """Draw parameters for rows of features."""
     keys = jax.random.split(key, features.shape[0])
     return jax.vmap(sample, (0, None, 0))(keys, policy, features)
 
 
-def _log_prob_rows(policy: LinearGaussian, features: Array, theta: Array) -> Array:
+def log_prob_rows(policy: LinearGaussian, features: Array, theta: Array) -> Array:
+    """Return the log densities of rows of parameters, in nats."""
     noise = whitened(policy, features, theta)
     constant = _half_log_det(policy) + 0.5 * _LOG_TWO_PI * theta.shape[1]
     return -0.5 * jnp.sum(noise**2, axis=1) - constant
@@ -295,7 +303,8 @@ def whitened(policy: LinearGaussian, features: Array, theta: Array) -> Array:
     return exact_dot(theta - exact_dot(features, policy.coef), inverse)
 
 
-def _blend(old: LinearGaussian, fitted: LinearGaussian, share: Scalar) -> LinearGaussian:
+def blend(old: Any, fitted: Any, share: Scalar) -> Any:
+    """Return the fitted policy, its covariance moved by a share of the way from the old to its own."""
     return fitted._replace(cov_chol=blended_cov_chol(old.cov_chol, fitted.cov_chol, share))
 
 
@@ -340,13 +349,22 @@ def checked(name: str, policy: LinearGaussian, features: FeatureMap) -> LinearGa
     policy = LinearGaussian(checks.converted(coef, dtype), checks.converted(cov_chol, dtype))
     for field, values in policy._asdict().items():
         checks.finite(f"{name}.{field}", values)
-    if not isinstance(policy.cov_chol, Tracer):
-        upper, diagonal = np.triu(policy.cov_chol, 1), np.diagonal(policy.cov_chol)
+    check_cov_chol(f"{name}.cov_chol", policy.cov_chol)
+    return policy
+
+
+def check_cov_chol(name: str, cov_chol: Float[Array, "d d"]) -> None:
+    """Check that a matrix is a Cholesky factor, unless it is traced.
+
+    Raises:
+        ValueError: If it is not lower triangular with a positive diagonal.
+    """
+    if not isinstance(cov_chol, Tracer):
+        upper, diagonal = np.triu(cov_chol, 1), np.diagonal(cov_chol)
         if upper.any():
             entry = upper[upper != 0][0]
-            raise ValueError(f"{name}.cov_chol must be lower triangular, got {entry} above its diagonal")
-        checks.finite(f"the diagonal of {name}.cov_chol", diagonal, above=0.0)
-    return policy
+            raise ValueError(f"{name} must be lower triangular, got {entry} above its diagonal")
+        checks.finite(f"the diagonal of {name}", diagonal, above=0.0)
 
 
 def _half_log_det(policy: LinearGaussian) -> Array:

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 
 from creps_jax.numerics.linalg import exact_dot
+from creps_jax.policies.bounded_covariance import as_cov_chol, least_multiplier
 from creps_jax.policies.gaussian import LinearGaussian
-from creps_jax.search.fit import as_cov_chol, least_multiplier
 from creps_jax.search.surrogate_fit import Quadratic
 from creps_jax.typing import Array, Float, Scalar, ScalarLike
 
