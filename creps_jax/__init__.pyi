@@ -11,6 +11,7 @@ from .policies.features import (
 )
 from .policies.gaussian import LinearGaussian, fit_weighted_ml, linear_gaussian, start_policy
 from .policies.learned import Learned, load, save
+from .policies.network import NetworkGaussian, network_policy, start_network
 from .policies.space import Space, sigmoid_gate
 from .robots.mjcf import humanoid_from_mjcf
 from .robots.nao_kinematics import leg_fk, leg_ik
@@ -48,6 +49,7 @@ __all__ = [
     "IterationLog",
     "Learned",
     "LinearGaussian",
+    "NetworkGaussian",
     "Outcome",
     "PlainOutcome",
     "Policy",
@@ -81,6 +83,7 @@ __all__ = [
     "make_iteration",
     "nao_steered_walk",
     "nao_walk",
+    "network_policy",
     "numerics",
     "penalised",
     "policies",
@@ -96,6 +99,7 @@ __all__ = [
     "simulation",
     "sinus",
     "solve_dual",
+    "start_network",
     "start_policy",
     "surrogate",
     "tasks",

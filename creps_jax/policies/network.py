@@ -1,0 +1,381 @@
+"""A Gaussian policy whose mean is a small network of the context.
+
+The mean is `coef' h(u)`, where u are the context variables, scaled to -1 to 1, and h(u) are a constant and
+the outputs of the last layer of tanh units. The covariance is the same for all contexts. Given h, the policy
+is a `LinearGaussian`, whose functions it uses.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import lax
+
+from creps_jax import checks
+from creps_jax.keys import threefry
+from creps_jax.numerics.linalg import divided, exact_dot, normalised
+from creps_jax.policies import gaussian
+from creps_jax.policies.base import Policy, WeightedSamples
+from creps_jax.policies.bounded_covariance import as_cov_chol, bounded_factor
+from creps_jax.policies.feature_functions import Polynomial
+from creps_jax.policies.features import FeatureMap, polynomial_features
+from creps_jax.policies.gaussian import LinearGaussian, start_policy
+from creps_jax.policies.regression import regress
+from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar, VectorLike
+
+__all__ = ["Layer", "NetworkGaussian", "network_policy", "start_network"]
+
+_BASELINE_DEGREE = 2
+"""Degree of the features, which also serve as those of the baseline."""
+_NUM_TRIALS, _NUM_REFINEMENTS = 32, 3
+"""Number of steps that are tried at once, and how often, to find the largest one within the bound."""
+_PENALTY = 3.0
+"""Penalty in the loss on each nat by which the change of the mean exceeds its bound."""
+_RIDGE = 1e-4
+"""Ridge of the regression that counts how much of the scatter the mean has used."""
+_MOST_UNITS = 10_000
+"""Largest number of units of a layer."""
+
+
+class Layer(NamedTuple):
+    """A layer of tanh units: `tanh(x weight + bias)`."""
+
+    weight: Float[Array, "i o"]
+    bias: Float[Array, " o"]
+
+
+class NetworkGaussian(NamedTuple):
+    """The policy pi(theta | s) = N(theta | coef' h(s), cov_chol cov_chol')."""
+
+    layers: tuple[Layer, ...]
+    """The layers of tanh units, from the context on."""
+    coef: Float[Array, "k d"]
+    """One row for the constant, and one for each unit of the last layer; one column for each parameter."""
+    cov_chol: Float[Array, "d d"]
+    """The lower Cholesky factor of the covariance; its diagonal is positive."""
+
+
+@checks.arguments
+def network_policy(
+    low: VectorLike,
+    high: VectorLike,
+    *,
+    steps: int = 100,
+    learning_rate: float | int = 0.1,
+    mean_kl_bound: float | int = 1.0,
+    cov_kl_bound: float | int = 0.05,
+    entropy_loss_bound: float | int | None = None,
+) -> Policy:
+    """Make the kind of policy whose mean is a small network of the context.
+
+    `creps(network_policy(low, high), archive_size=...)` searches with it; `start_network` makes the first
+    state. The fit takes a fixed number of steps of Adam from the old weights on the weighted log-likelihood.
+    Parameters are in units of the old covariance, whatever their own units. Then it goes back towards the old
+    weights as far as the bound on the change of the mean requires, and moves the covariance within its bounds
+    as `bounded_ml` does.
+
+    Args:
+        low: Lower end of the range of each context variable.
+        high: Upper end of the range of each context variable.
+        steps: Number of training steps of an update.
+        learning_rate: Learning rate of Adam in the first step; it falls to zero by a cosine.
+        mean_kl_bound: Largest relative entropy of the new policy to the old one that the change of the mean
+            causes, averaged over the contexts, in nats.
+        cov_kl_bound: The same for the change of the covariance.
+        entropy_loss_bound: Largest loss of differential entropy, in nats; by default only `cov_kl_bound`
+            limits it.
+
+    Returns:
+        The record of its functions; those of equal settings are equal. Its features are the polynomials of
+        degree 2 of the scaled context, which are good features of a baseline. The network has the scaled
+        context alone as its input.
+
+    Raises:
+        ValueError: If low and high are not vectors of one length with low < high, or a setting is not above
+            zero.
+    """
+    lows, highs = checks.ends(low, high)
+    bounds = {"mean_kl_bound": mean_kl_bound, "cov_kl_bound": cov_kl_bound}
+    if entropy_loss_bound is not None:
+        bounds["entropy_loss_bound"] = entropy_loss_bound
+    for name, value in {"learning_rate": learning_rate, **bounds}.items():
+        checks.number(name, value, above=0.0)
+    scaled = _ScaledPolynomial(tuple(lows.tolist()), tuple(highs.tolist()), _BASELINE_DEGREE)
+    fit = _Fit(steps, learning_rate, mean_kl_bound, cov_kl_bound, entropy_loss_bound)
+    return Policy(
+        polynomial_features(lows.size, _BASELINE_DEGREE)._replace(apply=scaled),
+        mean=_mean,
+        sample=_sample,
+        log_prob=_log_prob,
+        kl=_kl,
+        entropy=_entropy,
+        fit=fit,
+        blend=gaussian.blend,
+        noise=_noise,
+        checked=_checked,
+    )
+
+
+@checks.arguments
+def start_network(
+    key: PRNGKey,
+    features: FeatureMap,
+    theta_dim: int,
+    *,
+    hidden: int | tuple[int, ...] = 32,
+    mean: VectorLike = 0.0,
+    std: VectorLike = 1.0,
+) -> NetworkGaussian:
+    """Make the first state of a search with a `network_policy`: the same policy for every context.
+
+    Args:
+        key: Random key of the weights of the hidden layers.
+        features: The features of the policy, `network_policy(...).features`.
+        theta_dim: Number d of parameters.
+        hidden: Number of tanh units of each hidden layer: a number for one layer, or one for each.
+        mean: Mean of the free parameters, as in `start_policy`.
+        std: Their standard deviations, likewise.
+
+    Returns:
+        The state; its parameters are independent of each other.
+
+    Raises:
+        ValueError: If a layer has no unit or too many, or for what `start_policy` refuses.
+    """
+    sizes = _sizes(hidden)
+    num = sizes[-1]
+    constant = (1.0,) + (0.0,) * num
+    units = FeatureMap(_no_function, 1 + num, features.context_dim, constant=constant)
+    coef, cov_chol = start_policy(units, theta_dim, mean=mean, std=std)
+    layers = []
+    num_inputs, key = features.context_dim, threefry(key)
+    for size, layer_key in zip(sizes, jax.random.split(key, len(sizes)), strict=True):
+        weight_key, bias_key = jax.random.split(layer_key)
+        # Inputs from -1 to 1 have a mean square of 1/3.
+        weight = math.sqrt(3.0 / num_inputs) * jax.random.normal(weight_key, (num_inputs, size))
+        layers.append(Layer(weight, jax.random.uniform(bias_key, (size,), minval=-1.0, maxval=1.0)))
+        num_inputs = size
+    return NetworkGaussian(tuple(layers), coef, cov_chol)
+
+
+def _sizes(hidden: Any) -> tuple[int, ...]:
+    given = hidden if isinstance(hidden, tuple | list) else (hidden,)
+    if not given:
+        raise ValueError(f"hidden must have a number of units for at least one layer, got {hidden}")
+    sizes = tuple(checks.count("hidden", size) for size in given)
+    if max(sizes) > _MOST_UNITS:
+        raise ValueError(f"hidden must be at most {_MOST_UNITS} units for each layer, got {hidden}")
+    return sizes
+
+
+def _no_function(context: Array) -> Array:
+    raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class _ScaledPolynomial:
+    """Compute all monomials up to a degree of the context, scaled from a range to -1 to 1."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    degree: int
+
+    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
+        """Return the features of a context."""
+        context = checks.finite("context", checks.array("context", context, (len(self.low),)))
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        # Halves: the difference of large numbers overflows.
+        middle, half = (jnp.asarray(0.5 * high + sign * 0.5 * low, context.dtype) for sign in (1.0, -1.0))
+        return Polynomial(len(self.low), self.degree)((context - middle) / half)
+
+
+def _units(layers: tuple[Layer, ...], features: Float[Array, "n p"]) -> Float[Array, "n k"]:
+    """Return the constant and the outputs of the last layer for the features of n contexts."""
+    # The features are the constant, the scaled context, and its products.
+    units = features[:, 1 : 1 + layers[0].weight.shape[0]]
+    for weight, bias in layers:
+        units = jnp.tanh(exact_dot(units, weight) + bias[None, :])
+    return jnp.concatenate([features[:, :1], units], axis=1)
+
+
+def _linear(state: NetworkGaussian) -> LinearGaussian:
+    """Return the policy as one that is linear in the units of the last layer."""
+    return LinearGaussian(state.coef, state.cov_chol)
+
+
+def _mean(state: NetworkGaussian, features: Array) -> Array:
+    return gaussian.mean_rows(_linear(state), _units(state.layers, features))
+
+
+def _sample(key: PRNGKey, state: NetworkGaussian, features: Array) -> Array:
+    return gaussian.sample_rows(key, _linear(state), _units(state.layers, features))
+
+
+def _log_prob(state: NetworkGaussian, features: Array, theta: Array) -> Array:
+    return gaussian.log_prob_rows(_linear(state), _units(state.layers, features), theta)
+
+
+def _kl(state: NetworkGaussian, reference: NetworkGaussian, features: Array) -> Array:
+    # Only the shift of the mean depends on the context.
+    linear = _linear(state)
+    without_shift = gaussian.kl(linear, _linear(reference), jnp.zeros_like(linear.coef[:, 0]))
+    shifts = divided(_mean(state, features) - _mean(reference, features), reference.cov_chol.T)
+    return without_shift + 0.5 * jnp.sum(shifts**2, axis=1)
+
+
+def _entropy(state: NetworkGaussian) -> Scalar:
+    return gaussian.entropy(_linear(state))
+
+
+def _noise(state: NetworkGaussian, features: Array, theta: Array) -> Array:
+    return gaussian.whitened(_linear(state), _units(state.layers, features), theta)
+
+
+class _Weights(NamedTuple):
+    """The weights of a network whose outputs are in units of the old covariance; or a change of them."""
+
+    layers: tuple[Layer, ...]
+    coef: Float[Array, "k d"]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Fit:
+    """Fit a network to weighted samples within the bounds of `network_policy`."""
+
+    steps: int
+    learning_rate: float | int
+    mean_kl_bound: float | int
+    cov_kl_bound: float | int
+    entropy_loss_bound: float | int | None
+
+    def __call__(self, old: Any, samples: WeightedSamples) -> NetworkGaussian:
+        checks.instance("policy", old, NetworkGaussian)
+        features, theta, weights, is_valid = samples
+        is_weighted, is_valid = weights > 0, is_valid & jnp.all(jnp.isfinite(features), axis=1)
+        features = jnp.where((is_weighted | is_valid)[:, None], features, 0.0)
+        theta = jnp.where(is_weighted[:, None], theta, 0.0)
+        weights = normalised(jnp.where(is_weighted, weights, 0.0))
+        start = _Weights(old.layers, divided(old.coef, old.cov_chol.T))
+        first = _outputs(start, features)
+        target = divided(theta, old.cov_chol.T) - first
+
+        def shift_by(change: _Weights) -> Array:
+            return _outputs(jax.tree.map(jnp.add, start, change), features) - first
+
+        def mean_kl(change: _Weights) -> Scalar:
+            return _mean_square(shift_by(change), is_valid)
+
+        def loss(change: _Weights) -> Scalar:
+            shift = shift_by(change)
+            excess = jnp.maximum(_mean_square(shift, is_valid) - self.mean_kl_bound, 0.0)
+            squares = jnp.sum((target - shift) ** 2, axis=1)
+            return 0.5 * exact_dot(weights, squares) + _PENALTY * excess
+
+        change = self._trained(loss, start)
+        share = _largest_share(lambda share: mean_kl(_scaled(change, share)), self.mean_kl_bound, theta.dtype)
+        change = _scaled(change, share)
+        new = jax.tree.map(jnp.add, start, change)
+        residual = target - shift_by(change)
+        used = share * (2.0 - share) * (1.0 - _normaliser(new, features, theta, weights))
+        scatter = exact_dot(residual.T, weights[:, None] * residual) / (1.0 - used)  # Eq. 15
+        factor = bounded_factor(scatter, self.cov_kl_bound, self.entropy_loss_bound)
+        size = jnp.max(jnp.abs(theta), axis=0)
+        size = jnp.where(size > 0, size, 1.0)[:, None]
+        cov_chol = size * as_cov_chol(exact_dot(old.cov_chol / size, factor), old.cov_chol / size)
+        fitted = NetworkGaussian(new.layers, exact_dot(new.coef, old.cov_chol.T), cov_chol)
+        has_weight = jnp.any(is_weighted)
+        return jax.tree.map(lambda new, old: jnp.where(has_weight, new, old), fitted, old)
+
+    def _trained(self, loss: Callable[[_Weights], Scalar], start: _Weights) -> _Weights:
+        """Return the change of the weights that training makes."""
+        # As the search converges, the outputs grow in units of the covariance: hidden weights then have to
+        # change less for a shift of one unit.
+        spread = jnp.sum(start.coef[1:] ** 2) / start.coef.shape[1]
+        rate = lax.rsqrt(1.0 + spread)
+
+        def scaled(change: _Weights) -> _Weights:
+            return _Weights(_scaled(change.layers, rate), change.coef)
+
+        optimiser = optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.steps))
+
+        def step(carry: tuple[_Weights, Any], _: None) -> tuple[tuple[_Weights, Any], None]:
+            change, state = carry
+            gradient = jax.grad(lambda change: loss(scaled(change)))(change)
+            # Optax needs the usual promotion of types, which users may have switched off.
+            with jax.numpy_dtype_promotion("standard"):
+                updates, state = optimiser.update(gradient, state)
+                return (optax.apply_updates(change, updates), state), None
+
+        change = jax.tree.map(jnp.zeros_like, start)
+        (change, _), _ = lax.scan(step, (change, optimiser.init(change)), length=self.steps)
+        return scaled(change)
+
+
+def _outputs(weights: _Weights, features: Array) -> Array:
+    return exact_dot(_units(weights.layers, features), weights.coef)
+
+
+def _normaliser(new: _Weights, features: Array, theta: Array, weights: Array) -> Scalar:
+    """Return Z of Eq. 15 for a mean that is linear in the units of the last layer.
+
+    Training the layers below uses more of the scatter, and early stopping less.
+    """
+    units = _units(new.layers, features)
+    constant = jnp.zeros_like(units[0]).at[0].set(1.0)
+    return regress(units, theta, weights, ridge=_RIDGE, constant=constant).normaliser
+
+
+def _scaled(change: Any, share: Array) -> Any:
+    return jax.tree.map(lambda leaf: share * leaf, change)
+
+
+def _mean_square(shift: Float[Array, "n d"], is_valid: Bool[Array, " n"]) -> Scalar:
+    """Return the relative entropy of shifts in units of the covariance, averaged over the contexts."""
+    num = jnp.maximum(jnp.sum(is_valid, dtype=shift.dtype), 1.0)
+    return 0.5 * jnp.sum(jnp.where(is_valid[:, None], shift, 0.0) ** 2) / num
+
+
+def _largest_share(kl: Callable[[Scalar], Scalar], bound: float | int, dtype: Any) -> Scalar:
+    """Return the largest share of a change whose relative entropy is within the bound."""
+    shares = jnp.linspace(0.0, 1.0, _NUM_TRIALS + 1, dtype=dtype)
+
+    def refine(ends: tuple[Scalar, Scalar], _: None) -> tuple[tuple[Scalar, Scalar], None]:
+        low, high = ends
+        trials = low + shares * (high - low)
+        last = jnp.max(jnp.where(jax.vmap(kl)(trials) <= bound, jnp.arange(_NUM_TRIALS + 1), 0))
+        return (trials[last], trials[jnp.minimum(last + 1, _NUM_TRIALS)]), None
+
+    ends = (jnp.zeros((), dtype), jnp.ones((), dtype))
+    (share, _), _ = lax.scan(refine, ends, length=_NUM_REFINEMENTS)
+    return share
+
+
+def _checked(name: str, state: Any, features: FeatureMap) -> NetworkGaussian:
+    """Return a state in one precision, after checking that it fits the features.
+
+    Raises:
+        ValueError: If it does not, is not finite, or `cov_chol` is no Cholesky factor.
+    """
+    checks.instance(name, state, NetworkGaussian)
+    if not isinstance(state.layers, tuple) or not state.layers:
+        raise ValueError(f"{name}.layers must be a tuple of layers, got {checks.shown(state.layers)}")
+    size, layers = features.context_dim, []
+    for index, layer in enumerate(state.layers):
+        checks.instance(f"{name}.layers[{index}]", layer, Layer)
+        weight = checks.array(f"{name}.layers[{index}].weight", layer.weight, (size, "o"))
+        size = weight.shape[1]
+        layers.append(Layer(weight, checks.array(f"{name}.layers[{index}].bias", layer.bias, (size,))))
+    coef = checks.array(f"{name}.coef", state.coef, (1 + size, "d"))
+    cov_chol = checks.array(f"{name}.cov_chol", state.cov_chol, (coef.shape[1],) * 2)
+    state = NetworkGaussian(tuple(layers), coef, cov_chol)
+    dtype = jnp.result_type(*jax.tree.leaves(state))
+    for path, leaf in jax.tree.leaves_with_path(state):
+        checks.finite(name + jax.tree_util.keystr(path), leaf)
+    state = jax.tree.map(lambda leaf: checks.converted(leaf, dtype), state)
+    gaussian.check_cov_chol(f"{name}.cov_chol", state.cov_chol)
+    return state
