@@ -7,6 +7,7 @@ is a `LinearGaussian`, whose functions it uses.
 
 import dataclasses
 import math
+import numbers
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -153,7 +154,7 @@ def start_network(
     units = FeatureMap(_no_function, 1 + num, features.context_dim, constant=constant)
     coef, cov_chol = start_policy(units, theta_dim, mean=mean, std=std)
     layers = []
-    num_inputs, key = features.context_dim, threefry(key)
+    num_inputs, key = checks.count("features.context_dim", features.context_dim), threefry(key)
     for size, layer_key in zip(sizes, jax.random.split(key, len(sizes)), strict=True):
         weight_key, bias_key = jax.random.split(layer_key)
         # Inputs from -1 to 1 have a mean square of 1/3.
@@ -164,13 +165,14 @@ def start_network(
 
 
 def _sizes(hidden: Any) -> tuple[int, ...]:
-    given = hidden if isinstance(hidden, tuple | list) else (hidden,)
-    if not given:
-        raise ValueError(f"hidden must have a number of units for at least one layer, got {hidden}")
-    sizes = tuple(checks.count("hidden", size) for size in given)
-    if max(sizes) > _MOST_UNITS:
-        raise ValueError(f"hidden must be at most {_MOST_UNITS} units for each layer, got {hidden}")
-    return sizes
+    sizes = tuple(hidden) if isinstance(hidden, tuple | list) else (hidden,)
+    is_whole = all(isinstance(size, numbers.Integral) and not isinstance(size, bool) for size in sizes)
+    if not sizes or not is_whole or not all(1 <= size <= _MOST_UNITS for size in sizes):
+        raise ValueError(
+            f"hidden must be a number of units from 1 to {_MOST_UNITS}, or one for each layer, "
+            f"got {checks.shown(hidden)}"
+        )
+    return tuple(map(int, sizes))
 
 
 def _no_function(context: Array) -> Array:

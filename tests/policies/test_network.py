@@ -238,9 +238,10 @@ def test_another_kind_of_state_is_named():
 @pytest.mark.parametrize(
     ("hidden", "match"),
     [
-        (0, "hidden must be at least 1, got 0"),
-        ((), r"hidden must have a number of units for at least one layer, got \(\)"),
-        (10**6, "hidden must be at most 10000 units for each layer, got 1000000"),
+        (0, "hidden must be a number of units from 1 to 10000, or one for each layer, got 0"),
+        ((), r"or one for each layer, got \(\)"),
+        ((8, 0), r"or one for each layer, got \(8, 0\)"),
+        (10**6, "or one for each layer, got 1000000"),
     ],
 )
 def test_layers_without_units_are_refused(key, hidden, match):
