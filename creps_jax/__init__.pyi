@@ -4,6 +4,7 @@ from .numerics.linalg import thomas_solve
 from .policies.base import Policy, WeightedSamples
 from .policies.features import (
     FeatureMap,
+    kernel_features,
     linear_features,
     polynomial_features,
     quadratic_features,
@@ -73,6 +74,7 @@ __all__ = [
     "hole_reaching",
     "humanoid_from_mjcf",
     "humanoid_from_toml",
+    "kernel_features",
     "learned",
     "learned_walker",
     "leg_fk",

@@ -762,6 +762,7 @@ ROWS = {
     ),
     "network_policy": row(
         cj.network_policy,
+        use=lambda _: (),
         low=vector(0.0),
         high=vector(1.0),
         steps=count(3),
@@ -873,6 +874,14 @@ ROWS = {
         penalty=number(10.0, least=0.0),
     ),
     "polynomial_features": row(polynomial_features, use=use_features, dim=count(2), degree=count(3)),
+    "kernel_features": row(
+        cj.kernel_features,
+        use=use_features,
+        low=vector(0.0),
+        high=vector(1.0),
+        num=count(3),
+        bandwidth=optional(vector(0.2)),
+    ),
     "quadratic_features": row(cj.quadratic_features, use=use_features, dim=count(2)),
     "rbf_features": row(
         cj.rbf_features,

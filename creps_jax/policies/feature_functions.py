@@ -1,9 +1,10 @@
-"""Compute features of a context: linear, quadratic, polynomial, normalised radial basis functions.
+"""Compute features of a context: linear, quadratic, polynomial, radial basis functions, a kernel.
 
 Each function is a record of numbers: records with equal numbers are equal, and can be copied and pickled.
 """
 
 import dataclasses
+import functools
 import itertools
 
 import jax
@@ -12,9 +13,10 @@ import numpy as np
 from jax import lax
 
 from creps_jax import checks
+from creps_jax.numerics.linalg import exact_dot
 from creps_jax.typing import Array, Float
 
-__all__ = ["Linear", "Polynomial", "Quadratic", "Radial", "grid_of_centers"]
+__all__ = ["Kernel", "Linear", "Polynomial", "Quadratic", "Radial", "grid_of_centers", "inducing_contexts"]
 
 _FAR = 1e20
 """Largest distance from the range, in bandwidths. A context farther away is moved to this distance, so that
@@ -25,6 +27,12 @@ the inverse of a bandwidth, can round that inverse to zero."""
 _NARROW = 1e-9
 """Bandwidth, relative to the range, below which squares of distances can overflow. Centres are then at least
 a hundred bandwidths apart, and only the nearest one has a weight."""
+
+
+_FARTHEST = 1e17
+"""The same for a kernel, where squares of several variables are added."""
+_JITTER = 1e-6
+"""Added to the kernel matrix of the inducing contexts, whose smallest eigenvalues are below the rounding."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,6 +123,67 @@ class Radial:
         # Without the barrier, compilers compute all costs again for each term of the sum over them.
         # In print: psi_j / sum of psi, psi_j = exp(-(s - c_j)^2 / (2 sigma^2))
         return jax.nn.softmax(jnp.asarray(lax.optimization_barrier(-jnp.sum(costs, axis=1))))  # Eq. 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Kernel:
+    """Compute a constant and the features of a sparse Gaussian process."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    num: int
+    bandwidth: tuple[float, ...]
+
+    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
+        """Return the features of a context."""
+        context = _checked_context(context, len(self.low))
+        low, high, bandwidth = (np.asarray(numbers) for numbers in (self.low, self.high, self.bandwidth))
+        # Halves: the difference of large numbers overflows.
+        middle, half = 0.5 * high + 0.5 * low, 0.5 * high - 0.5 * low
+        ratio = half / bandwidth
+        points = (2.0 * inducing_contexts(low.size, self.num) - 1.0) * ratio
+        root = _inverse_root(self.num, tuple(ratio.tolist()))
+        middle, half, ratio, points, root = (
+            jnp.asarray(numbers, context.dtype) for numbers in (middle, half, ratio, points, root)
+        )
+        scaled = jnp.clip((context - middle) / half * ratio, -_FARTHEST, _FARTHEST)
+        distance = scaled[None, :] - points
+        covariance = jnp.exp(-0.5 * jnp.sum(distance**2, axis=1))
+        return jnp.concatenate([jnp.ones_like(covariance[:1]), exact_dot(covariance, root)])
+
+
+def inducing_contexts(dim: int, num: int) -> np.ndarray:
+    """Return the first points (num, dim) of the Halton sequence, which fill the cube from 0 to 1 evenly."""
+    return np.stack([_radical_inverse(np.arange(1, num + 1), base) for base in _primes(dim)], axis=1)
+
+
+def _primes(num: int) -> list[int]:
+    primes: list[int] = []
+    for number in itertools.count(2):
+        if len(primes) == num:
+            return primes
+        if all(number % prime for prime in primes):
+            primes.append(number)
+    return primes
+
+
+def _radical_inverse(index: np.ndarray, base: int) -> np.ndarray:
+    """Return the digits of indices in a base as fractions, the last digit first."""
+    result, place = np.zeros(index.shape), 1.0
+    while index.any():
+        index, digit = np.divmod(index, base)
+        place /= base
+        result = result + digit * place
+    return result
+
+
+@functools.lru_cache
+def _inverse_root(num: int, scale: tuple[float, ...]) -> np.ndarray:
+    """Return the inverse root of the kernel matrix of the inducing contexts, scaled to bandwidths of one."""
+    points = (2.0 * inducing_contexts(len(scale), num) - 1.0) * np.array(scale)
+    covariance = np.exp(-0.5 * np.sum((points[:, None] - points[None]) ** 2, axis=2))
+    values, axes = np.linalg.eigh(covariance + _JITTER * np.eye(num))
+    return (axes / np.sqrt(np.maximum(values, _JITTER))) @ axes.T
 
 
 def grid_of_centers(low: np.ndarray, high: np.ndarray, num_centers: tuple[int, ...]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Make features of the context: linear, quadratic, polynomial, normalised radial basis functions.
+"""Make features of the context: linear, quadratic, polynomial, radial basis functions, a kernel.
 
 Equal settings make equal features, which can be copied and pickled, and described by plain values.
 """
@@ -11,11 +11,19 @@ import jax
 import numpy as np
 
 from creps_jax import checks
-from creps_jax.policies.feature_functions import Linear, Polynomial, Quadratic, Radial, grid_of_centers
+from creps_jax.policies.feature_functions import (
+    Kernel,
+    Linear,
+    Polynomial,
+    Quadratic,
+    Radial,
+    grid_of_centers,
+)
 from creps_jax.typing import Array, Float, VectorLike
 
 __all__ = [
     "FeatureMap",
+    "kernel_features",
     "linear_features",
     "polynomial_features",
     "quadratic_features",
@@ -25,6 +33,10 @@ __all__ = [
 
 _MOST_FEATURES = 1_000_000
 """Largest number of monomials, which grows fast: more would fill the memory."""
+_MOST_POINTS = 2000
+"""Largest number of inducing contexts: the eigenvalues of a larger kernel matrix take minutes."""
+_BANDWIDTHS = (1e-3, 1e3)
+"""Least and largest bandwidth of a kernel, relative to the range."""
 
 
 class FeatureMap(NamedTuple):
@@ -194,6 +206,54 @@ def rbf_grid(
     return grid_of_centers(lows, highs, counts), widths
 
 
+@checks.arguments
+def kernel_features(
+    low: VectorLike, high: VectorLike, num: int, *, bandwidth: VectorLike | None = None
+) -> FeatureMap:
+    """Make the features of a sparse Gaussian process with a squared-exponential kernel.
+
+    With `num` inducing contexts Z, the features are a constant and `K(Z, Z)^-1/2 k(Z, s)`, where
+    `k(z, s) = exp(-sum (z - s)^2 / (2 bandwidth^2))`. Bayesian linear regression on them is regression with
+    the Gaussian process that the inducing contexts represent (the projected process), and the ridge of a fit
+    is its prior. The inducing contexts are the first points of the Halton sequence. Their number does not
+    grow with the number of context variables as that of a grid does: use these features for three to six
+    variables.
+
+    Args:
+        low: Lower end of the range of each context variable.
+        high: Upper end of the range of each context variable.
+        num: Number of inducing contexts.
+        bandwidth: Distance over which the mean changes, along each context variable, in its unit;
+            0.75 (high - low) by default.
+
+    Returns:
+        The map to 1 + num features. Far outside the range only the constant is left.
+
+    Raises:
+        ValueError: If the settings differ in length, a number is not finite, low >= high, there are too many
+            inducing contexts, or a bandwidth is not from 0.001 to 1000 times the range; on `apply`, if a
+            context has another shape than (dim,).
+
+    Source: Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, Section 8.3.4.
+    """
+    lows, highs = checks.ends(low, high)
+    if num > _MOST_POINTS:
+        raise ValueError(f"num must be at most {_MOST_POINTS} inducing contexts, got {num}")
+    # Halves: the difference of large numbers overflows.
+    halves = 0.5 * highs - 0.5 * lows
+    widths = 1.5 * halves if bandwidth is None else checks.vector("bandwidth", bandwidth)
+    if widths.shape not in ((), (1,), lows.shape):
+        raise ValueError(f"bandwidth must be a number or as long as low, {lows.size}, got {bandwidth}")
+    relative = 0.5 * (widths / halves)
+    if not np.all((relative >= _BANDWIDTHS[0]) & (relative <= _BANDWIDTHS[1])):
+        least, most = (f"{each:g}" for each in _BANDWIDTHS)
+        raise ValueError(f"bandwidth must be from {least} to {most} times high - low, got {bandwidth}")
+    widths = np.broadcast_to(widths, lows.shape)
+    kernel = Kernel(tuple(lows.tolist()), tuple(highs.tolist()), num, tuple(widths.tolist()))
+    size = 1 + num
+    return FeatureMap(kernel, size, lows.size, scale=(1.0,) * size, constant=(1.0,) + (0.0,) * num)
+
+
 def describe(features: FeatureMap) -> dict[str, Any]:
     """Describe features by plain values, from which `from_description` makes them again.
 
@@ -242,9 +302,20 @@ def from_description(description: Mapping[str, Any], own: FeatureMap | None = No
     return own
 
 
-_KINDS = {"linear": Linear, "quadratic": Quadratic, "polynomial": Polynomial, "rbf": Radial}
+_KINDS = {
+    "linear": Linear,
+    "quadratic": Quadratic,
+    "polynomial": Polynomial,
+    "rbf": Radial,
+    "kernel": Kernel,
+}
 """The functions of each kind."""
-_MAKERS = {"linear": linear_features, "quadratic": quadratic_features, "polynomial": polynomial_features}
+_MAKERS = {
+    "linear": linear_features,
+    "quadratic": quadratic_features,
+    "polynomial": polynomial_features,
+    "kernel": kernel_features,
+}
 """Makers of the kinds whose settings are the fields of their functions."""
 
 

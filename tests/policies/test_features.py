@@ -2,6 +2,7 @@
 
 import copy
 import itertools
+import json
 import math
 import pickle
 from functools import partial
@@ -10,8 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import qmc
 
+from creps_jax.policies.feature_functions import inducing_contexts
 from creps_jax.policies.features import (
+    describe,
+    from_description,
+    kernel_features,
     linear_features,
     polynomial_features,
     quadratic_features,
@@ -24,6 +30,7 @@ MAPS = {
     "quadratic": quadratic_features(2),
     "polynomial": polynomial_features(2, 3),
     "radial": rbf_features((0.0, -1.0), (1.0, 3.0), 3),
+    "kernel": kernel_features((0.0, -1.0), (1.0, 3.0), 12),
 }
 
 
@@ -34,14 +41,16 @@ def test_protocol(name, key):
     row = features.apply(context)
     assert row.shape == (features.size,)
     assert row.dtype == jnp.float32
-    np.testing.assert_allclose(jax.jit(features.apply)(context), row, rtol=1e-6)
+    # The inverse root of the kernel matrix enlarges rounding.
+    rounding = 1e-5 if name == "kernel" else 0.0
+    np.testing.assert_allclose(jax.jit(features.apply)(context), row, rtol=1e-6, atol=rounding)
     if features.scale is not None:
         far = jax.vmap(features.apply)(100.0 * jax.random.normal(key, (200, 2)))
         assert (jnp.abs(far) <= jnp.asarray(features.scale)[None]).all()
         # The outermost features get that large.
         np.testing.assert_allclose(jnp.abs(far).max(), max(features.scale), rtol=1e-3)
     rows = jax.vmap(features.apply)(jnp.stack([context, 2 * context]))
-    np.testing.assert_allclose(rows[0], row, rtol=1e-6)
+    np.testing.assert_allclose(rows[0], row, rtol=1e-6, atol=rounding)
     with pytest.raises(ValueError, match=r"shape \(2,\), got \(3,\)"):
         features.apply(jnp.zeros(3))
 
@@ -89,6 +98,8 @@ MAKERS = {
     "polynomial of another degree": lambda: polynomial_features(2, 3),
     "radial": lambda: rbf_features((0.0, -1.0), (1.0, 3.0), 3),
     "radial of NumPy": lambda: rbf_features(np.array([0.0, -2.0]), jnp.array([1.0, 3.0]), 3),
+    "kernel": lambda: kernel_features((0.0, -1.0), (1.0, 3.0), 9),
+    "kernel of another width": lambda: kernel_features((0.0, -1.0), (1.0, 3.0), 9, bandwidth=0.2),
     "radial of another width": lambda: rbf_features((0.0, -1.0), (1.0, 3.0), 3, bandwidth=0.2),
 }
 
@@ -303,3 +314,67 @@ def test_bad_radial_settings_are_named(args, bandwidth, message):
 def test_bad_dimension_is_named(make):
     with pytest.raises(ValueError, match="dim must be at least 1, got 0"):
         make(0)
+
+
+@pytest.mark.parametrize("name", MAPS)
+def test_features_are_described_by_plain_values(name):
+    described = json.loads(json.dumps(describe(MAPS[name])))
+    assert from_description(described) == MAPS[name]
+
+
+@pytest.mark.parametrize("dim", [1, 3, 6])
+def test_inducing_contexts_are_a_halton_sequence(dim):
+    expected = qmc.Halton(dim, scramble=False).random(51)[1:]
+    np.testing.assert_allclose(inducing_contexts(dim, 50), expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("width", [None, (0.3, 2.0), 40.0])
+def test_products_of_kernel_features_are_the_covariances_that_the_inducing_contexts_represent(width):
+    low, high = np.array([0.0, -1.0]), np.array([1.0, 3.0])
+    features = kernel_features(low, high, 20, bandwidth=width)
+    widths = 0.75 * (high - low) if width is None else np.broadcast_to(width, 2)
+
+    def kernel(left, right):
+        return np.exp(-0.5 * np.sum(((left[:, None] - right[None]) / widths) ** 2, axis=2))
+
+    points = low + inducing_contexts(2, 20) * (high - low)
+    contexts = np.float32(np.random.default_rng(0).uniform(low - 0.5, high + 0.5, (30, 2)))
+    rows = np.asarray(features(jnp.asarray(contexts)), float)
+    np.testing.assert_array_equal(rows[:, 0], 1.0)
+    between = kernel(contexts, points)
+    expected = between @ np.linalg.solve(kernel(points, points) + 1e-6 * np.eye(20), between.T)
+    np.testing.assert_allclose(rows[:, 1:] @ rows[:, 1:].T, expected, atol=2e-3)
+    # With narrow kernels inducing contexts know themselves, and nothing else.
+    narrow = kernel_features(low, high, 5, bandwidth=0.01 * (high - low))
+    points = low + inducing_contexts(2, 5) * (high - low)
+    np.testing.assert_allclose(narrow(jnp.float32(points))[:, 1:], np.eye(5), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(0.0, 1e-30), (-3e38, 3e38), (-LARGEST, LARGEST), (3e38, 3.1e38), (0.0, 1.0)]
+)
+def test_kernel_features_are_finite_anywhere(low, high):
+    features = kernel_features((low, low), (high, high), 6)
+    numbers = [-LARGEST, -1e20, 0.0, 1e-30, 0.5, low, high, 0.5 * high + 0.5 * low, LARGEST]
+    contexts = jnp.float32(list(itertools.product(numbers, repeat=2)))
+    rows = jax.jit(jax.vmap(features.apply))(contexts)
+    assert np.isfinite(rows).all() and (np.abs(rows) <= 1.001).all()
+    middle = jnp.float32([[0.5 * high + 0.5 * low] * 2])
+    ordinary = kernel_features((0.0, 0.0), (1.0, 1.0), 6)(jnp.float32([[0.5, 0.5]]))
+    np.testing.assert_allclose(features(middle), ordinary, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"num": 0}, "num must be at least 1, got 0"),
+        ({"num": 10_000}, "num must be at most 2000 inducing contexts, got 10000"),
+        ({"bandwidth": 0.0}, r"bandwidth must be from 0\.001 to 1000 times high - low, got 0\.0"),
+        ({"bandwidth": 1e4}, r"bandwidth must be from 0\.001 to 1000 times high - low, got 10000\.0"),
+        ({"bandwidth": (0.1, 0.1)}, r"bandwidth must be a number or as long as low, 1, got \(0\.1, 0\.1\)"),
+        ({"low": 1.0}, "low must be below high"),
+    ],
+)
+def test_kernels_that_cannot_be_are_named(changes, match):
+    with pytest.raises(ValueError, match=match):
+        kernel_features(**({"low": 0.0, "high": 1.0, "num": 5} | changes))
