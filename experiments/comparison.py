@@ -3,13 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from creps_jax.policies.base import Policy
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.search.creps import Creps, creps
@@ -18,7 +19,7 @@ from creps_jax.search.importance import Importance
 from creps_jax.tasks.base import Task
 from creps_jax.training import evaluate
 from experiments import records
-from experiments.learning import Plan, Session, learn, trial_keys
+from experiments.learning import Plan, Session, learn, mean_arrays, trial_keys, with_mean
 from experiments.records import Arrays, Part
 
 NUM_EVALUATED = 40
@@ -30,12 +31,12 @@ class Contender(NamedTuple):
     Attributes:
         task: the task; contenders may draw its contexts from different distributions.
         algorithm: the search.
-        start: the first policy of every trial.
+        start: the first policy of every trial, a `LinearGaussian` or a `NetworkGaussian`.
     """
 
     task: Task
     algorithm: Creps
-    start: LinearGaussian
+    start: Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,19 +85,31 @@ class LearnerSettings(Schedule):
 
 
 def make_contender(
-    task: Task, features: tuple[FeatureMap, FeatureMap], settings: LearnerSettings
+    task: Task, features: tuple[FeatureMap | Policy, FeatureMap], settings: LearnerSettings, start: Any = None
 ) -> Contender:
-    """Make a contender from policy and baseline features and the settings of an experiment."""
+    """Make a contender from policy and baseline features and the settings of an experiment.
+
+    Args:
+        task: the task.
+        features: features of policy and baseline; or another kind of policy, with its own fit, and the latter.
+        settings: settings of the experiment.
+        start: the first policy; by default the same Gaussian for every context.
+    """
+    policy, baseline = features
+    fit: dict[str, Any] = {}
+    if isinstance(policy, FeatureMap):
+        m_step = fit_within(settings.mean_kl_bound, settings.cov_kl_bound)
+        fit = {"ridge": settings.ridge, "m_step": m_step}
+        start = start_policy(policy, task.theta_dim, std=settings.start_std) if start is None else start
     algorithm = creps(
-        *features,
+        policy,
+        baseline,
         kl_bound=settings.kl_bound,
         archive_size=settings.archive_size,
-        ridge=settings.ridge,
-        m_step=fit_within(settings.mean_kl_bound, settings.cov_kl_bound),
         significance=settings.significance,
         importance=None if settings.importance_policies is None else Importance(settings.importance_policies),
+        **fit,
     )
-    start = start_policy(features[0], task.theta_dim, std=settings.start_std)
     return Contender(task, algorithm, start)
 
 
@@ -120,8 +133,8 @@ def compare(
     Returns:
         `context`, the grid; `episodes` (iterations,) and `evaluated`, the iterations (from 1) after which
         mean policies were evaluated; and a part for each contender (see `records.Part`): `sample_reward` and
-        the fields of `plots.TRACES` (trials, iterations), `grid_reward` (trials, evaluated, n), and `coef`
-        (trials, p, d) of the last policies.
+        the fields of `plots.TRACES` (trials, iterations), `grid_reward` (trials, evaluated, n), and the
+        arrays of the last policies, such as `coef` (trials, p, d).
     """
     # Rollouts are too short to share between devices: share the trials.
     devices = jax.local_devices()
@@ -141,11 +154,11 @@ def compare(
     for name, contender in contenders.items():
         _, log = learn(keys, *contender, plan, session=session, name=name, devices=devices)
         # A resumed run may have gone on for longer than is asked of it now.
-        coef = log["coef"][:, evaluated - 1]
+        means = {field: log[field][:, evaluated - 1] for field in mean_arrays(contender.start)}
         curves = {"sample_reward": log["mean_reward"], **records.traces(Part(log, "info"))}
         found = {field: values[:, : plan.iterations] for field, values in curves.items()}
-        found["grid_reward"] = _grid_reward(evaluate_key, contender, coef, grid)
-        arrays |= records.named(name, {**found, "coef": coef[:, -1]})
+        found["grid_reward"] = _grid_reward(evaluate_key, contender, means, grid)
+        arrays |= records.named(name, found | {field: values[:, -1] for field, values in means.items()})
     return arrays
 
 
@@ -238,11 +251,15 @@ def postures(
     return found
 
 
-def _grid_reward(key: jax.Array, contender: Contender, coef: np.ndarray, grid: jax.Array) -> np.ndarray:
-    """Return the reward of mean policies (trials, k, p, d) at contexts (n, s), as (trials, k, n)."""
-    trials, num, _, dim = coef.shape
-    means = jax.vmap(jax.vmap(lambda coef: mean_thetas(contender, coef, grid)))(jnp.asarray(coef))
+def _grid_reward(key: jax.Array, contender: Contender, means: Arrays, grid: jax.Array) -> np.ndarray:
+    """Return the reward of mean policies (trials, k, ...) at contexts (n, s), as (trials, k, n)."""
+
+    def thetas_of(means: Mapping[str, Any]) -> jax.Array:
+        return contender.algorithm.mean(with_mean(contender.start, means), grid)
+
+    thetas = jax.vmap(jax.vmap(thetas_of))({name: jnp.asarray(values) for name, values in means.items()})
+    trials, num, _, dim = thetas.shape
     contexts = jnp.tile(grid, (trials * num, 1))
     devices = jax.local_devices()[:1]
-    outcome = evaluate(key, contender.task, contexts, means.reshape(-1, dim), devices=devices)
+    outcome = evaluate(key, contender.task, contexts, thetas.reshape(-1, dim), devices=devices)
     return np.asarray(outcome.reward).reshape(trials, num, len(grid))

@@ -12,7 +12,6 @@ import numpy as np
 from rich.console import Console
 
 from creps_jax.checkpoints import Checkpoint, append_log, load_checkpoint, named_leaves, save_checkpoint
-from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.search.creps import Creps, CrepsState
 from creps_jax.tasks.base import Task
 from creps_jax.training import Samples, train_trials
@@ -84,7 +83,7 @@ def learn(
     keys: jax.Array,
     task: Task,
     algorithm: Creps,
-    policy: LinearGaussian,
+    policy: Any,
     plan: Plan,
     *,
     session: Session,
@@ -104,8 +103,9 @@ def learn(
         devices: devices that share the rollouts; all devices of all processes by default.
 
     Returns:
-        The last states (trials, ...), and the logs by name (trials, iterations, ...). `coef` are the
-        coefficients of the policy after each iteration; parts are `info` and `outcome`, see `records.Part`.
+        The last states (trials, ...), and the logs by name (trials, iterations, ...). The log has the arrays
+        of `mean_arrays` after each iteration, such as `coef`; parts are `info` and `outcome`, see
+        `records.Part`.
 
     Raises:
         KeyboardInterrupt: after the last complete iteration is saved.
@@ -150,6 +150,17 @@ def learn(
     return latest.state, {field: np.swapaxes(values, 0, 1) for field, values in latest.log.items()}
 
 
+def mean_arrays(policy: Any) -> dict[str, np.ndarray]:
+    """Return the arrays that the mean of a policy depends on, by name: `coef`, and layers of a network."""
+    return {name: values for name, values in named_leaves(policy).items() if name != "cov_chol"}
+
+
+def with_mean(policy: Any, arrays: Mapping[str, Any]) -> Any:
+    """Return a policy with other arrays of `mean_arrays`."""
+    leaves = [arrays.get(name, values) for name, values in named_leaves(policy).items()]
+    return jax.tree.unflatten(jax.tree.structure(policy), leaves)
+
+
 class _Keeper:
     """Save the latest iteration from time to time, and at the end, also after an error."""
 
@@ -168,7 +179,7 @@ class _Keeper:
 
     def take(self, state: CrepsState, log: Any) -> None:
         # A single assignment: an interrupt cannot leave a part of an iteration.
-        row = {**named_leaves(log._replace(samples=None)), "coef": np.asarray(state.policy.coef)}
+        row = {**named_leaves(log._replace(samples=None)), **mean_arrays(state.policy)}
         self.latest = Checkpoint(state, append_log(self.latest.log, row))
         if time.monotonic() - self._saved_at >= _SECONDS_BETWEEN_CHECKPOINTS:
             self._write()

@@ -47,6 +47,10 @@ EXPERIMENTS = {
         "compare the paper's fit of the policy with the bounded fit, on all tasks but walking",
         ("best", "quick"),
     ),
+    "policies": Entry(
+        "compare RBFs, polynomials, a Gaussian process and a network on the paper's four tasks",
+        ("quick", "full"),
+    ),
 }
 """The experiments by name, which is also the name of the module."""
 

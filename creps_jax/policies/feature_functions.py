@@ -16,7 +16,16 @@ from creps_jax import checks
 from creps_jax.numerics.linalg import exact_dot
 from creps_jax.typing import Array, Float
 
-__all__ = ["Kernel", "Linear", "Polynomial", "Quadratic", "Radial", "grid_of_centers", "inducing_contexts"]
+__all__ = [
+    "Kernel",
+    "Linear",
+    "Polynomial",
+    "Quadratic",
+    "Radial",
+    "ScaledPolynomial",
+    "grid_of_centers",
+    "inducing_contexts",
+]
 
 _FAR = 1e20
 """Largest distance from the range, in bandwidths. A context farther away is moved to this distance, so that
@@ -79,6 +88,23 @@ class Polynomial:
             monomials.append(_kept_finite(monomials[-1][factors] * context[last]))
             rows = {variables: row for row, variables in enumerate(combinations)}
         return jnp.concatenate(monomials)
+
+
+@dataclasses.dataclass(frozen=True)
+class ScaledPolynomial:
+    """Compute all monomials up to a degree of the context, scaled from a range to -1 to 1."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    degree: int
+
+    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
+        """Return the features of a context."""
+        context = _checked_context(context, len(self.low))
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        # Halves: the difference of large numbers overflows.
+        middle, half = (jnp.asarray(0.5 * high + sign * 0.5 * low, context.dtype) for sign in (1.0, -1.0))
+        return Polynomial(len(self.low), self.degree)((context - middle) / half)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax import lax
 
@@ -23,7 +22,7 @@ from creps_jax.numerics.linalg import divided, exact_dot, normalised
 from creps_jax.policies import gaussian
 from creps_jax.policies.base import Policy, WeightedSamples
 from creps_jax.policies.bounded_covariance import as_cov_chol, bounded_factor
-from creps_jax.policies.feature_functions import Polynomial
+from creps_jax.policies.feature_functions import ScaledPolynomial
 from creps_jax.policies.features import FeatureMap, polynomial_features
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.policies.regression import regress
@@ -106,7 +105,7 @@ def network_policy(
         bounds["entropy_loss_bound"] = entropy_loss_bound
     for name, value in {"learning_rate": learning_rate, **bounds}.items():
         checks.number(name, value, above=0.0)
-    scaled = _ScaledPolynomial(tuple(lows.tolist()), tuple(highs.tolist()), _BASELINE_DEGREE)
+    scaled = ScaledPolynomial(tuple(lows.tolist()), tuple(highs.tolist()), _BASELINE_DEGREE)
     fit = _Fit(steps, learning_rate, mean_kl_bound, cov_kl_bound, entropy_loss_bound)
     return Policy(
         polynomial_features(lows.size, _BASELINE_DEGREE)._replace(apply=scaled),
@@ -177,23 +176,6 @@ def _sizes(hidden: Any) -> tuple[int, ...]:
 
 def _no_function(context: Array) -> Array:
     raise NotImplementedError
-
-
-@dataclasses.dataclass(frozen=True)
-class _ScaledPolynomial:
-    """Compute all monomials up to a degree of the context, scaled from a range to -1 to 1."""
-
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    degree: int
-
-    def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
-        """Return the features of a context."""
-        context = checks.finite("context", checks.array("context", context, (len(self.low),)))
-        low, high = np.asarray(self.low), np.asarray(self.high)
-        # Halves: the difference of large numbers overflows.
-        middle, half = (jnp.asarray(0.5 * high + sign * 0.5 * low, context.dtype) for sign in (1.0, -1.0))
-        return Polynomial(len(self.low), self.degree)((context - middle) / half)
 
 
 def _units(layers: tuple[Layer, ...], features: Float[Array, "n p"]) -> Float[Array, "n k"]:

@@ -4,12 +4,13 @@ import dataclasses
 import importlib
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from creps_jax.errors import UserError
 from creps_jax.tools.tables import save_table
-from experiments import comparison, fig08_hole, updates
+from experiments import comparison, fig08_hole, policies, registry, updates
 from experiments.fig08_hole import Settings as HoleSettings
 from experiments.learning import Session
 
@@ -112,6 +113,43 @@ def test_updates_are_compared_on_the_same_problem(monkeypatch, tmp_path):
     assert set(updates.plot(arrays)) == {"learning_curves", "sphere_updates"}
     save_table(updates.table(arrays), tmp_path, said.append)
     assert (tmp_path / "table.md").read_text() == said[0] and "sphere" in said[0]
+
+
+@pytest.mark.usefixtures("simple_updates")
+def test_policies_are_compared_on_the_same_problem(tmp_path):
+    settings = policies.Settings(iterations=3, trials=2, tasks=("sinus", "hole"), hidden=7)
+    arrays = policies.run(settings, jax.random.key(0), Session(tmp_path))
+    for task in settings.tasks:
+        found = policies.of_task(arrays, task)
+        first = [found[f"{task}-{policy}.sample_reward"][:, 0] for policy in policies.LABELS]
+        for other in first[1:]:
+            np.testing.assert_allclose(other, first[0], rtol=1e-4)
+        sizes = {policy: found[f"{task}-{policy}.coef"].shape[1] for policy in policies.LABELS}
+        assert sizes["network"] == 8 and found[f"{task}-network.layers.0.weight"].shape == (2, 1, 7)
+    again = policies.run(settings, jax.random.key(0), Session(tmp_path))
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(again[name], values)
+    columns = policies.table(arrays)
+    assert columns["task"] == ["sinus", "hole"] and list(columns)[1:] == list(policies.LABELS.values())
+    assert set(policies.plot(arrays)) == {"learning_curves"}
+    assert all(np.isfinite(claim.measure(arrays)) for claim in policies.CLAIMS if "reach" not in claim.metric)
+
+
+def test_the_walk_is_one_of_the_tasks_of_the_policies():
+    plan = comparison.LearnerSettings(iterations=2, trials=1)
+    bench = policies.BENCHES["walk"](plan)
+    contenders = policies.make_contenders(bench, policies.Settings(), jax.random.key(0))
+    assert set(contenders) == set(policies.LABELS)
+    grid = jnp.array([[bench.low], [bench.high]])
+    for contender in contenders.values():
+        state = contender.algorithm.init(contender.start)
+        assert contender.algorithm.mean(state, grid).shape == (2, contender.task.theta_dim)
+
+
+def test_unknown_tasks_of_the_policies_are_named():
+    with pytest.raises(UserError, match="tasks must be some of sinus, reaching, hole, walk, got sinus, jump"):
+        policies.Settings(tasks=("sinus", "jump"))
+    assert registry.load("policies").SETTINGS["quick"].tasks == ("sinus", "reaching", "hole")
 
 
 def test_the_table_of_the_hole_tells_collisions_from_what_is_left():
