@@ -91,7 +91,7 @@ def make_contender(
 
     Args:
         task: the task.
-        features: features of policy and baseline; or another kind of policy, with its own fit, and the latter.
+        features: features of policy and baseline; or another kind of policy, and the latter.
         settings: settings of the experiment.
         start: the first policy; by default the same Gaussian for every context.
     """

@@ -249,16 +249,4 @@ def plot(arrays: Arrays) -> dict[str, Figure]:
     return {"learning_curves": plots.learning_curves(panels, columns=min(len(panels), 2), share=False)}
 
 
-def last_reward(arrays: Arrays, task: str, policy: str) -> float:
-    """Return the median reward of the last mean policies; NaN without the task."""
-    if task not in tasks_of(arrays):
-        return math.nan
-    return float(np.median(curves(arrays, task)[LABELS[policy]][1][:, -1]))
-
-
-def _relative_loss(arrays: Arrays, task: str, policy: str) -> float:
-    """Return the loss of a policy, minus its last reward, divided by the loss of RBFs."""
-    return last_reward(arrays, task, policy) / last_reward(arrays, task, "rbf")
-
-
 CLAIMS: tuple[Claim, ...] = ()

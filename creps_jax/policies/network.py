@@ -34,7 +34,7 @@ _BASELINE_DEGREE = 2
 """Degree of the features, which also serve as those of the baseline."""
 _NUM_TRIALS, _NUM_REFINEMENTS = 32, 3
 """Number of steps that are tried at once, and how often, to find the largest one within the bound."""
-_PENALTY = 3.0
+_PENALTY = 10.0
 """Penalty in the loss on each nat by which the change of the mean exceeds its bound."""
 _RIDGE = 1e-4
 """Ridge of the regression that counts how much of the scatter the mean has used."""

@@ -132,7 +132,6 @@ def test_policies_are_compared_on_the_same_problem(tmp_path):
     columns = policies.table(arrays)
     assert columns["task"] == ["sinus", "hole"] and list(columns)[1:] == list(policies.LABELS.values())
     assert set(policies.plot(arrays)) == {"learning_curves"}
-    assert all(np.isfinite(claim.measure(arrays)) for claim in policies.CLAIMS if "reach" not in claim.metric)
 
 
 def test_the_walk_is_one_of_the_tasks_of_the_policies():

@@ -97,10 +97,10 @@ def parts(new, old, samples):
 @pytest.mark.parametrize("bounds", [(0.3, 0.02), (0.1, 0.1), (1e-3, 1e-3)])
 def test_the_change_is_within_its_bounds(problem, bounds):
     old, samples = problem
-    kind = cj.network_policy(LOW, HIGH, steps=30, mean_kl_bound=bounds[0], cov_kl_bound=bounds[1])
+    kind = cj.network_policy(LOW, HIGH, mean_kl_bound=bounds[0], cov_kl_bound=bounds[1])
     new = jax.jit(kind.fit)(old, samples)
     mean_kl, cov_kl = parts(new, old, samples)
-    assert 0.5 * bounds[0] < mean_kl < 1.01 * bounds[0]
+    assert 0.8 * bounds[0] < mean_kl < 1.01 * bounds[0]
     assert cov_kl == pytest.approx(bounds[1], rel=0.01)
     assert kind.kl(new, old, samples.features).mean() == pytest.approx(mean_kl + cov_kl, rel=1e-3)
     better = samples.weights @ (
