@@ -12,7 +12,7 @@ from .policies.features import (
 )
 from .policies.gaussian import LinearGaussian, fit_weighted_ml, linear_gaussian, start_policy
 from .policies.learned import Learned, load, save
-from .policies.network import NetworkGaussian, network_policy, start_network
+from .policies.network import network_policy, start_network
 from .policies.space import Space, sigmoid_gate
 from .robots.mjcf import humanoid_from_mjcf
 from .robots.nao_kinematics import leg_fk, leg_ik
@@ -50,7 +50,6 @@ __all__ = [
     "IterationLog",
     "Learned",
     "LinearGaussian",
-    "NetworkGaussian",
     "Outcome",
     "PlainOutcome",
     "Policy",
