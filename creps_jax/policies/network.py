@@ -5,39 +5,28 @@ the outputs of the last layer of tanh units. The covariance is the same for all 
 is a `LinearGaussian`, whose functions it uses.
 """
 
-import dataclasses
 import math
 import numbers
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
-from jax import lax
 
 from creps_jax import checks
 from creps_jax.keys import threefry
-from creps_jax.numerics.linalg import divided, exact_dot, normalised
+from creps_jax.numerics.linalg import divided
 from creps_jax.policies import gaussian
-from creps_jax.policies.base import Policy, WeightedSamples
-from creps_jax.policies.bounded_covariance import as_cov_chol, bounded_factor
+from creps_jax.policies.base import Policy
 from creps_jax.policies.feature_functions import ScaledPolynomial
 from creps_jax.policies.features import FeatureMap, polynomial_features
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
-from creps_jax.policies.regression import regress
-from creps_jax.typing import Array, Bool, Float, PRNGKey, Scalar, VectorLike
+from creps_jax.policies.network_fit import NetworkFit, units
+from creps_jax.typing import Array, Float, PRNGKey, Scalar, VectorLike
 
 __all__ = ["Layer", "NetworkGaussian", "network_policy", "start_network"]
 
 _BASELINE_DEGREE = 2
 """Degree of the features, which also serve as those of the baseline."""
-_NUM_TRIALS, _NUM_REFINEMENTS = 32, 3
-"""Number of steps that are tried at once, and how often, to find the largest one within the bound."""
-_PENALTY = 10.0
-"""Penalty in the loss on each nat by which the change of the mean exceeds its bound."""
-_RIDGE = 1e-4
-"""Ridge of the regression that counts how much of the scatter the mean has used."""
 _MOST_UNITS = 10_000
 """Largest number of units of a layer."""
 
@@ -74,10 +63,12 @@ def network_policy(
     """Make the kind of policy whose mean is a small network of the context.
 
     `creps(network_policy(low, high), archive_size=...)` searches with it; `start_network` makes the first
-    state. The fit takes a fixed number of steps of Adam from the old weights on the weighted log-likelihood.
-    Parameters are in units of the old covariance, whatever their own units. Then it goes back towards the old
-    weights as far as the bound on the change of the mean requires, and moves the covariance within its bounds
-    as `bounded_ml` does.
+    state. Give the size of the archive: the default counts the features, not the units of the network.
+
+    The fit takes a fixed number of steps of Adam from the old weights on the weighted log-likelihood, in
+    which parameters are in units of the old covariance, whatever their own units. Then it goes back towards
+    the old weights as far as the bound on the change of the mean requires, and moves the covariance within
+    its bounds as `bounded_ml` does.
 
     Args:
         low: Lower end of the range of each context variable.
@@ -106,7 +97,7 @@ def network_policy(
     for name, value in {"learning_rate": learning_rate, **bounds}.items():
         checks.number(name, value, above=0.0)
     scaled = ScaledPolynomial(tuple(lows.tolist()), tuple(highs.tolist()), _BASELINE_DEGREE)
-    fit = _Fit(steps, learning_rate, mean_kl_bound, cov_kl_bound, entropy_loss_bound)
+    fit = NetworkFit(steps, learning_rate, mean_kl_bound, cov_kl_bound, entropy_loss_bound)
     return Policy(
         polynomial_features(lows.size, _BASELINE_DEGREE)._replace(apply=scaled),
         mean=_mean,
@@ -150,8 +141,8 @@ def start_network(
     sizes = _sizes(hidden)
     num = sizes[-1]
     constant = (1.0,) + (0.0,) * num
-    units = FeatureMap(_no_function, 1 + num, features.context_dim, constant=constant)
-    coef, cov_chol = start_policy(units, theta_dim, mean=mean, std=std)
+    last = FeatureMap(_no_function, 1 + num, features.context_dim, constant=constant)
+    coef, cov_chol = start_policy(last, theta_dim, mean=mean, std=std)
     layers = []
     num_inputs, key = checks.count("features.context_dim", features.context_dim), threefry(key)
     for size, layer_key in zip(sizes, jax.random.split(key, len(sizes)), strict=True):
@@ -178,30 +169,21 @@ def _no_function(context: Array) -> Array:
     raise NotImplementedError
 
 
-def _units(layers: tuple[Layer, ...], features: Float[Array, "n p"]) -> Float[Array, "n k"]:
-    """Return the constant and the outputs of the last layer for the features of n contexts."""
-    # The features are the constant, the scaled context, and its products.
-    units = features[:, 1 : 1 + layers[0].weight.shape[0]]
-    for weight, bias in layers:
-        units = jnp.tanh(exact_dot(units, weight) + bias[None, :])
-    return jnp.concatenate([features[:, :1], units], axis=1)
-
-
 def _linear(state: NetworkGaussian) -> LinearGaussian:
     """Return the policy as one that is linear in the units of the last layer."""
     return LinearGaussian(state.coef, state.cov_chol)
 
 
 def _mean(state: NetworkGaussian, features: Array) -> Array:
-    return gaussian.mean_rows(_linear(state), _units(state.layers, features))
+    return gaussian.mean_rows(_linear(state), units(state.layers, features))
 
 
 def _sample(key: PRNGKey, state: NetworkGaussian, features: Array) -> Array:
-    return gaussian.sample_rows(key, _linear(state), _units(state.layers, features))
+    return gaussian.sample_rows(key, _linear(state), units(state.layers, features))
 
 
 def _log_prob(state: NetworkGaussian, features: Array, theta: Array) -> Array:
-    return gaussian.log_prob_rows(_linear(state), _units(state.layers, features), theta)
+    return gaussian.log_prob_rows(_linear(state), units(state.layers, features), theta)
 
 
 def _kl(state: NetworkGaussian, reference: NetworkGaussian, features: Array) -> Array:
@@ -217,126 +199,7 @@ def _entropy(state: NetworkGaussian) -> Scalar:
 
 
 def _noise(state: NetworkGaussian, features: Array, theta: Array) -> Array:
-    return gaussian.whitened(_linear(state), _units(state.layers, features), theta)
-
-
-class _Weights(NamedTuple):
-    """The weights of a network whose outputs are in units of the old covariance; or a change of them."""
-
-    layers: tuple[Layer, ...]
-    coef: Float[Array, "k d"]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Fit:
-    """Fit a network to weighted samples within the bounds of `network_policy`."""
-
-    steps: int
-    learning_rate: float | int
-    mean_kl_bound: float | int
-    cov_kl_bound: float | int
-    entropy_loss_bound: float | int | None
-
-    def __call__(self, old: Any, samples: WeightedSamples) -> NetworkGaussian:
-        checks.instance("policy", old, NetworkGaussian)
-        features, theta, weights, is_valid = samples
-        is_weighted, is_valid = weights > 0, is_valid & jnp.all(jnp.isfinite(features), axis=1)
-        features = jnp.where((is_weighted | is_valid)[:, None], features, 0.0)
-        theta = jnp.where(is_weighted[:, None], theta, 0.0)
-        weights = normalised(jnp.where(is_weighted, weights, 0.0))
-        start = _Weights(old.layers, divided(old.coef, old.cov_chol.T))
-        first = _outputs(start, features)
-        target = divided(theta, old.cov_chol.T) - first
-
-        def shift_by(change: _Weights) -> Array:
-            return _outputs(jax.tree.map(jnp.add, start, change), features) - first
-
-        def mean_kl(change: _Weights) -> Scalar:
-            return _mean_square(shift_by(change), is_valid)
-
-        def loss(change: _Weights) -> Scalar:
-            shift = shift_by(change)
-            excess = jnp.maximum(_mean_square(shift, is_valid) - self.mean_kl_bound, 0.0)
-            squares = jnp.sum((target - shift) ** 2, axis=1)
-            return 0.5 * exact_dot(weights, squares) + _PENALTY * excess
-
-        change = self._trained(loss, start)
-        share = _largest_share(lambda share: mean_kl(_scaled(change, share)), self.mean_kl_bound, theta.dtype)
-        change = _scaled(change, share)
-        new = jax.tree.map(jnp.add, start, change)
-        residual = target - shift_by(change)
-        used = share * (2.0 - share) * (1.0 - _normaliser(new, features, theta, weights))
-        scatter = exact_dot(residual.T, weights[:, None] * residual) / (1.0 - used)  # Eq. 15
-        factor = bounded_factor(scatter, self.cov_kl_bound, self.entropy_loss_bound)
-        size = jnp.max(jnp.abs(theta), axis=0)
-        size = jnp.where(size > 0, size, 1.0)[:, None]
-        cov_chol = size * as_cov_chol(exact_dot(old.cov_chol / size, factor), old.cov_chol / size)
-        fitted = NetworkGaussian(new.layers, exact_dot(new.coef, old.cov_chol.T), cov_chol)
-        has_weight = jnp.any(is_weighted)
-        return jax.tree.map(lambda new, old: jnp.where(has_weight, new, old), fitted, old)
-
-    def _trained(self, loss: Callable[[_Weights], Scalar], start: _Weights) -> _Weights:
-        """Return the change of the weights that training makes."""
-        # As the search converges, the outputs grow in units of the covariance: hidden weights then have to
-        # change less for a shift of one unit.
-        spread = jnp.sum(start.coef[1:] ** 2) / start.coef.shape[1]
-        rate = lax.rsqrt(1.0 + spread)
-
-        def scaled(change: _Weights) -> _Weights:
-            return _Weights(_scaled(change.layers, rate), change.coef)
-
-        optimiser = optax.adam(optax.cosine_decay_schedule(self.learning_rate, self.steps))
-
-        def step(carry: tuple[_Weights, Any], _: None) -> tuple[tuple[_Weights, Any], None]:
-            change, state = carry
-            gradient = jax.grad(lambda change: loss(scaled(change)))(change)
-            # Optax needs the usual promotion of types, which users may have switched off.
-            with jax.numpy_dtype_promotion("standard"):
-                updates, state = optimiser.update(gradient, state)
-                return (optax.apply_updates(change, updates), state), None
-
-        change = jax.tree.map(jnp.zeros_like, start)
-        (change, _), _ = lax.scan(step, (change, optimiser.init(change)), length=self.steps)
-        return scaled(change)
-
-
-def _outputs(weights: _Weights, features: Array) -> Array:
-    return exact_dot(_units(weights.layers, features), weights.coef)
-
-
-def _normaliser(new: _Weights, features: Array, theta: Array, weights: Array) -> Scalar:
-    """Return Z of Eq. 15 for a mean that is linear in the units of the last layer.
-
-    Training the layers below uses more of the scatter, and early stopping less.
-    """
-    units = _units(new.layers, features)
-    constant = jnp.zeros_like(units[0]).at[0].set(1.0)
-    return regress(units, theta, weights, ridge=_RIDGE, constant=constant).normaliser
-
-
-def _scaled(change: Any, share: Array) -> Any:
-    return jax.tree.map(lambda leaf: share * leaf, change)
-
-
-def _mean_square(shift: Float[Array, "n d"], is_valid: Bool[Array, " n"]) -> Scalar:
-    """Return the relative entropy of shifts in units of the covariance, averaged over the contexts."""
-    num = jnp.maximum(jnp.sum(is_valid, dtype=shift.dtype), 1.0)
-    return 0.5 * jnp.sum(jnp.where(is_valid[:, None], shift, 0.0) ** 2) / num
-
-
-def _largest_share(kl: Callable[[Scalar], Scalar], bound: float | int, dtype: Any) -> Scalar:
-    """Return the largest share of a change whose relative entropy is within the bound."""
-    shares = jnp.linspace(0.0, 1.0, _NUM_TRIALS + 1, dtype=dtype)
-
-    def refine(ends: tuple[Scalar, Scalar], _: None) -> tuple[tuple[Scalar, Scalar], None]:
-        low, high = ends
-        trials = low + shares * (high - low)
-        last = jnp.max(jnp.where(jax.vmap(kl)(trials) <= bound, jnp.arange(_NUM_TRIALS + 1), 0))
-        return (trials[last], trials[jnp.minimum(last + 1, _NUM_TRIALS)]), None
-
-    ends = (jnp.zeros((), dtype), jnp.ones((), dtype))
-    (share, _), _ = lax.scan(refine, ends, length=_NUM_REFINEMENTS)
-    return share
+    return gaussian.whitened(_linear(state), units(state.layers, features), theta)
 
 
 def _checked(name: str, state: Any, features: FeatureMap) -> NetworkGaussian:
