@@ -15,7 +15,7 @@ import pytest
 import creps_jax as cj
 from creps_jax.contexts import uniform_contexts
 from creps_jax.policies.features import FeatureMap, linear_features, polynomial_features, rbf_features
-from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.search import creps as creps_functions
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import creps
@@ -165,6 +165,27 @@ def test_an_archive_that_is_too_small_is_warned_of_with_the_number_that_would_do
     small = creps(FEATURES, FEATURES, archive_size=10)
     with pytest.warns(UserWarning, match="archive_size should be at least 12.*got 10"):
         small.init(START)
+
+
+@pytest.mark.parametrize(("num_centers", "archive_size"), [((4, 4), 239), ((11, 1), 164)])
+def test_many_features_for_the_archive_are_warned_of(num_centers, archive_size):
+    features = rbf_features((0.0, 0.0), (1.0, 1.0), num_centers)
+    start = start_policy(features, 5)
+    with pytest.warns(
+        UserWarning, match=f"at least {archive_size + 1}, 3 samples for each.*got {archive_size}"
+    ):
+        creps(features, FEATURES, archive_size=archive_size).init(start)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        creps(features, FEATURES, archive_size=archive_size + 1).init(start)
+        assert len(creps(features, FEATURES).init(start).archive.batch.reward) == archive_size + 1
+
+
+def test_few_features_are_not_warned_of():
+    features = rbf_features((0.0, 0.0), (1.0, 1.0), (5, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        creps(features, FEATURES, archive_size=80).init(start_policy(features, 30))
 
 
 @pytest.mark.parametrize(("num_centers", "archive_size"), [(6, 30), (6, 36)])
