@@ -25,7 +25,8 @@ class Features:
         num_centers: Number K of RBF centres: one for all context variables, or one for each; None is 5 for
             one variable, 3 along each of two, and 2 along each of more.
         bandwidth: Width of the RBFs in the units of the context; None is (high - low) / K.
-        degree: Largest sum of the exponents in a monomial of polynomial features; None is 2.
+        degree: Largest sum of the exponents in a monomial of polynomial features; None is 3 for three
+            variables, and 2 for other numbers of them.
     """
 
     kind: str | None = None
@@ -42,7 +43,7 @@ class Features:
         """Return the settings for a number of context variables, with the default kind and size."""
         kind = self._kind(dim)
         if kind == "polynomial":
-            return dataclasses.replace(self, kind=kind, degree=self._degree())
+            return dataclasses.replace(self, kind=kind, degree=self._degree(dim))
         return dataclasses.replace(self, kind=kind, num_centers=self._centers(dim))
 
     def make(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
@@ -59,7 +60,7 @@ class Features:
         if kind == "linear":
             return linear_features(dim)
         if kind == "polynomial":
-            return polynomial_features(dim, self._degree())
+            return polynomial_features(dim, self._degree(dim))
         if kind == "rbf":
             return rbf_features(low, high, self._centers(dim), bandwidth=self.bandwidth)
         raise ValueError(f"features must be one of {', '.join(FEATURE_KINDS)}, got {self.kind!r}")
@@ -83,8 +84,9 @@ class Features:
         is_radial = dim <= 2 or self.num_centers is not None or self.bandwidth is not None
         return "rbf" if is_radial else "polynomial"
 
-    def _degree(self) -> int:
-        return 2 if self.degree is None else self.degree
+    def _degree(self, dim: int) -> int:
+        # Products of three of many variables would be too many features.
+        return (3 if dim == 3 else 2) if self.degree is None else self.degree
 
     def _centers(self, dim: int) -> int | tuple[int, ...]:
         return {1: 5, 2: 3}.get(dim, 2) if self.num_centers is None else self.num_centers

@@ -23,6 +23,7 @@ __all__ = [
     "checked_policy",
     "checked_state",
     "precision_of",
+    "samples_for_many_features",
     "theta_dim_of",
 ]
 
@@ -75,8 +76,9 @@ def checked_archive_size(settings: CrepsSettings, theta_dim: int) -> int:
     """Return the size of the archive, after checking that it is not too small."""
     num_features, num_baseline = settings.kind.features.size, settings.baseline_features.size
     num_fitted, size = num_features + theta_dim, settings.archive_size
+    for_many = samples_for_many_features(num_features, theta_dim)
     if size is None:
-        return max(_DEFAULT_SAMPLES * max(num_fitted, num_baseline), _for_many(num_features, theta_dim))
+        return max(_DEFAULT_SAMPLES * max(num_fitted, num_baseline), for_many)
     if size < num_fitted:
         raise ValueError(
             f"archive_size must be at least {num_fitted}, the number of features and parameters, got {size}"
@@ -87,7 +89,6 @@ def checked_archive_size(settings: CrepsSettings, theta_dim: int) -> int:
             f"otherwise explain all rewards, got {size}"
         )
     enough = _ENOUGH_SAMPLES * max(num_fitted, num_baseline)
-    for_many = _for_many(num_features, theta_dim)
     if enough <= size < for_many:
         warnings.warn(
             f"archive_size should be at least {for_many}, {_SAMPLES_OF_MANY} samples for each of the "
@@ -105,7 +106,7 @@ def checked_archive_size(settings: CrepsSettings, theta_dim: int) -> int:
     return size
 
 
-def _for_many(num_features: int, theta_dim: int) -> int:
+def samples_for_many_features(num_features: int, theta_dim: int) -> int:
     """Return the least number of samples for many features, 0 for few."""
     return _SAMPLES_OF_MANY * num_features * theta_dim if num_features > _FEW_FEATURES else 0
 

@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import qmc
 
 from creps_jax.policies.feature_functions import inducing_contexts
+from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import (
     describe,
     from_description,
@@ -378,3 +379,9 @@ def test_kernel_features_are_finite_anywhere(low, high):
 def test_kernels_that_cannot_be_are_named(changes, match):
     with pytest.raises(ValueError, match=match):
         kernel_features(**({"low": 0.0, "high": 1.0, "num": 5} | changes))
+
+
+@pytest.mark.parametrize(("dim", "size"), [(1, 5), (2, 9), (3, 20), (4, 15), (5, 21)])
+def test_the_default_features_depend_on_the_number_of_contexts(dim, size):
+    low, high = (-1.0,) * dim, (1.0,) * dim
+    assert Features().make(low, high).size == Features().complete(dim).make(low, high).size == size

@@ -15,6 +15,7 @@ from creps_jax.policies.features import FeatureMap, describe
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.policies.learned import Learned
 from creps_jax.policies.space import Space
+from creps_jax.search.input_checks import samples_for_many_features
 from creps_jax.tools.session.plain import shortest
 from creps_jax.tools.session.settings import Context, FirstPolicy, Parameter, Settings, ends
 
@@ -75,11 +76,16 @@ def complete(settings: Settings) -> Settings:
     Raises:
         UserError: if the settings of the features are out of their ranges.
     """
-    settings = dataclasses.replace(settings, features=settings.features.complete(len(settings.contexts)))
+    features = settings.features.complete(len(settings.contexts))
+    if features.kind == "polynomial" and settings.features.degree is None:
+        # Products of three variables are too many features for the hundreds of trials of a session.
+        features = dataclasses.replace(features, degree=2)
+    settings = dataclasses.replace(settings, features=features)
     if settings.archive_size is None:
         # An update needs as many trials as there are features and parameters.
-        least = feature_map(settings).size + len(settings.parameters)
-        settings = dataclasses.replace(settings, archive_size=max(5 * settings.batch_size, 2 * least))
+        num_features, theta_dim = feature_map(settings).size, len(settings.parameters)
+        least = max(2 * (num_features + theta_dim), samples_for_many_features(num_features, theta_dim))
+        settings = dataclasses.replace(settings, archive_size=max(5 * settings.batch_size, least))
     if settings.first_policy is not None:
         return settings
     parameters = [
