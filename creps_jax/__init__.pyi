@@ -4,7 +4,6 @@ from .numerics.linalg import thomas_solve
 from .policies.base import Policy, WeightedSamples
 from .policies.features import (
     FeatureMap,
-    kernel_features,
     linear_features,
     polynomial_features,
     quadratic_features,
@@ -12,7 +11,6 @@ from .policies.features import (
 )
 from .policies.gaussian import LinearGaussian, fit_weighted_ml, linear_gaussian, start_policy
 from .policies.learned import Learned, load, save
-from .policies.network import network_policy, start_network
 from .policies.space import Space, sigmoid_gate
 from .robots.mjcf import humanoid_from_mjcf
 from .robots.nao_kinematics import leg_fk, leg_ik
@@ -23,7 +21,7 @@ from .search.creps import Creps, CrepsInfo, CrepsState, creps
 from .search.dual import DualSolution, sample_weights, solve_dual
 from .search.fit import bounded_ml, weighted_ml
 from .search.importance import Importance
-from .search.surrogate import Surrogate, SurrogateInfo, SurrogateState, surrogate
+from .search.surrogate import surrogate
 from .tasks.base import Outcome, PlainOutcome, Task, average_repeats, penalised, sigmoid_constrained
 from .tasks.planar_arm import hole_reaching, via_point_reaching
 from .tasks.sine import sinus
@@ -55,9 +53,6 @@ __all__ = [
     "Policy",
     "Search",
     "Space",
-    "Surrogate",
-    "SurrogateInfo",
-    "SurrogateState",
     "Task",
     "Walker",
     "WeightedSamples",
@@ -73,7 +68,6 @@ __all__ = [
     "hole_reaching",
     "humanoid_from_mjcf",
     "humanoid_from_toml",
-    "kernel_features",
     "learned",
     "learned_walker",
     "leg_fk",
@@ -84,7 +78,6 @@ __all__ = [
     "make_iteration",
     "nao_steered_walk",
     "nao_walk",
-    "network_policy",
     "numerics",
     "penalised",
     "policies",
@@ -100,7 +93,6 @@ __all__ = [
     "simulation",
     "sinus",
     "solve_dual",
-    "start_network",
     "start_policy",
     "surrogate",
     "tasks",

@@ -29,7 +29,8 @@ import creps_jax as cj
 from creps_jax import tasks
 from creps_jax.files import policies_folder
 from creps_jax.numerics import rotations
-from creps_jax.policies.features import polynomial_features
+from creps_jax.policies.features import kernel_features, polynomial_features
+from creps_jax.policies.network import network_policy, start_network
 from creps_jax.robots import mjcf, nao_geometry, screw_kinematics, spec
 from creps_jax.robots.robot import NAO, NAO_H25
 from creps_jax.search.archive import push
@@ -761,7 +762,7 @@ ROWS = {
         std=vector((1.0, 2.0)),
     ),
     "network_policy": row(
-        cj.network_policy,
+        network_policy,
         use=lambda _: (),
         low=vector(0.0),
         high=vector(1.0),
@@ -772,9 +773,9 @@ ROWS = {
         entropy_loss_bound=optional(number(0.1, above=0.0)),
     ),
     "start_network": row(
-        cj.start_network,
+        start_network,
         key=key(KEY),
-        features=features(cj.network_policy(0.0, 1.0).features),
+        features=features(network_policy(0.0, 1.0).features),
         theta_dim=count(2),
         hidden=count(3),
         mean=vector((0.5, 1.0)),
@@ -875,7 +876,7 @@ ROWS = {
     ),
     "polynomial_features": row(polynomial_features, use=use_features, dim=count(2), degree=count(3)),
     "kernel_features": row(
-        cj.kernel_features,
+        kernel_features,
         use=use_features,
         low=vector(0.0),
         high=vector(1.0),

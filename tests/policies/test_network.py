@@ -12,10 +12,10 @@ import pytest
 import creps_jax as cj
 from creps_jax import checkpoints
 from creps_jax.policies.base import WeightedSamples
-from creps_jax.policies.network import Layer, NetworkGaussian
+from creps_jax.policies.network import Layer, NetworkGaussian, network_policy, start_network
 
 LOW, HIGH = (-1.0, 0.0), (1.0, 4.0)
-KIND = cj.network_policy(LOW, HIGH, steps=20)
+KIND = network_policy(LOW, HIGH, steps=20)
 BOUNDS = KIND.fit.mean_kl_bound, KIND.fit.cov_kl_bound
 
 
@@ -39,7 +39,7 @@ def grid_regret(task, algorithm, state):
 def problem():
     """Return a state that is not the same for all contexts, and samples whose weights prefer some of them."""
     keys = jax.random.split(jax.random.key(3), 4)
-    state = cj.start_network(keys[0], KIND.features, 3, hidden=(8, 6), std=(0.1, 1.0, 20.0))
+    state = start_network(keys[0], KIND.features, 3, hidden=(8, 6), std=(0.1, 1.0, 20.0))
     state = state._replace(coef=jax.random.normal(keys[1], state.coef.shape) * jnp.array([[0.1, 1.0, 20.0]]))
     contexts = jax.random.uniform(keys[2], (80, 2), minval=jnp.array(LOW), maxval=jnp.array(HIGH))
     features = KIND.features(contexts)
@@ -49,19 +49,19 @@ def problem():
 
 
 def test_the_first_state_is_the_same_for_every_context(key):
-    features = cj.network_policy(LOW, HIGH).features
-    state = cj.start_network(key, features, 3, hidden=(8, 4), mean=(1.0, 2.0, 3.0), std=0.5)
+    features = network_policy(LOW, HIGH).features
+    state = start_network(key, features, 3, hidden=(8, 4), mean=(1.0, 2.0, 3.0), std=0.5)
     assert [layer.weight.shape for layer in state.layers] == [(2, 8), (8, 4)]
     means = KIND.mean(state, features(cj.context_grid(LOW, HIGH, 5)))
     np.testing.assert_allclose(means, np.tile([1.0, 2.0, 3.0], (25, 1)), rtol=1e-6)
     np.testing.assert_array_equal(state.cov_chol, 0.5 * np.eye(3))
-    same = cj.start_network(key, features, 3, hidden=(8, 4), mean=(1.0, 2.0, 3.0), std=0.5)
+    same = start_network(key, features, 3, hidden=(8, 4), mean=(1.0, 2.0, 3.0), std=0.5)
     jax.tree.map(np.testing.assert_array_equal, state, same)
 
 
 def test_features_are_polynomials_of_the_scaled_context():
     np.testing.assert_allclose(KIND.features(jnp.array([1.0, 1.0])), [1, 1, -0.5, 1, -0.5, 0.25], rtol=1e-6)
-    large = cj.network_policy(-3e38, 3e38).features
+    large = network_policy(-3e38, 3e38).features
     np.testing.assert_allclose(large(jnp.array([3e38])), [1.0, 1.0, 1.0], rtol=1e-5)
 
 
@@ -72,9 +72,9 @@ def test_a_network_learns_what_linear_features_cannot(key):
     algorithm = cj.creps(linear, m_step=cj.bounded_ml(), archive_size=200)
     state, _ = cj.train(key, task, algorithm, cj.start_policy(linear, 2), **settings)
     of_linear = grid_regret(task, algorithm, state)
-    kind = cj.network_policy(LOW, HIGH, steps=50)
+    kind = network_policy(LOW, HIGH, steps=50)
     algorithm = cj.creps(kind, archive_size=200)
-    start = cj.start_network(key, kind.features, 2)
+    start = start_network(key, kind.features, 2)
     state, log = cj.train(key, task, algorithm, start, **settings)
     assert log.info.is_updated[5:].all()
     assert grid_regret(task, algorithm, state) < 0.15 * of_linear
@@ -97,7 +97,7 @@ def parts(new, old, samples):
 @pytest.mark.parametrize("bounds", [(0.3, 0.02), (0.1, 0.1), (1e-3, 1e-3)])
 def test_the_change_is_within_its_bounds(problem, bounds):
     old, samples = problem
-    kind = cj.network_policy(LOW, HIGH, mean_kl_bound=bounds[0], cov_kl_bound=bounds[1])
+    kind = network_policy(LOW, HIGH, mean_kl_bound=bounds[0], cov_kl_bound=bounds[1])
     new = jax.jit(kind.fit)(old, samples)
     mean_kl, cov_kl = parts(new, old, samples)
     assert 0.8 * bounds[0] < mean_kl < 1.01 * bounds[0]
@@ -111,7 +111,7 @@ def test_the_change_is_within_its_bounds(problem, bounds):
 
 def test_the_loss_of_entropy_is_within_its_bound(problem):
     old, samples = problem
-    kind = cj.network_policy(LOW, HIGH, steps=20, cov_kl_bound=5.0, entropy_loss_bound=0.01)
+    kind = network_policy(LOW, HIGH, steps=20, cov_kl_bound=5.0, entropy_loss_bound=0.01)
     new = kind.fit(old, samples)
     assert float(kind.entropy(old) - kind.entropy(new)) < 0.0101
 
@@ -148,7 +148,7 @@ def test_samples_without_weight_may_hold_anything(problem):
 def test_failed_rollouts_are_ignored(key):
     algorithm = cj.creps(KIND, archive_size=60)
     contexts = jax.random.uniform(key, (60, 2), minval=jnp.array(LOW), maxval=jnp.array(HIGH))
-    state = algorithm.init(cj.start_network(key, KIND.features, 2, hidden=8))
+    state = algorithm.init(start_network(key, KIND.features, 2, hidden=8))
     theta = algorithm.ask(key, state, contexts)
     reward = np.array(-jnp.sum(theta**2, axis=1))
     reward[::5] = np.nan
@@ -175,7 +175,7 @@ def test_the_fit_does_not_depend_on_the_units_of_the_parameters(problem):
 
 def test_trials_are_single_searches_and_a_saved_state_resumes_exactly(key, tmp_path):
     task, algorithm = bent_task(), cj.creps(KIND, archive_size=80)
-    start = cj.start_network(key, KIND.features, 2, hidden=(8, 8))
+    start = start_network(key, KIND.features, 2, hidden=(8, 8))
     keys = jax.random.split(key, 2)
     settings = {"samples": 20}
     whole, log = cj.train(keys[1], task, algorithm, start, iterations=6, **settings)
@@ -198,14 +198,14 @@ def test_trials_are_single_searches_and_a_saved_state_resumes_exactly(key, tmp_p
 
 
 def test_policies_of_equal_settings_are_equal_and_can_be_copied():
-    make = partial(cj.network_policy, LOW, HIGH)
+    make = partial(network_policy, LOW, HIGH)
     policy = make()
     for same in (make(), copy.deepcopy(policy), pickle.loads(pickle.dumps(policy))):
         assert same == policy and hash(same) == hash(policy)
-    assert policy != make(steps=3) and policy != cj.network_policy(LOW, (1.0, 5.0))
+    assert policy != make(steps=3) and policy != network_policy(LOW, (1.0, 5.0))
 
 
-STATE = cj.start_network(jax.random.key(0), KIND.features, 2, hidden=4)
+STATE = start_network(jax.random.key(0), KIND.features, 2, hidden=4)
 
 
 @pytest.mark.parametrize(
@@ -246,15 +246,15 @@ def test_another_kind_of_state_is_named():
 )
 def test_layers_without_units_are_refused(key, hidden, match):
     with pytest.raises(ValueError, match=match):
-        cj.start_network(key, KIND.features, 2, hidden=hidden)
+        start_network(key, KIND.features, 2, hidden=hidden)
 
 
 def test_bounds_that_are_not_above_zero_are_refused():
     for name in ("learning_rate", "mean_kl_bound", "cov_kl_bound", "entropy_loss_bound"):
         with pytest.raises(ValueError, match=f"{name} must be finite and above 0, got 0.0"):
-            cj.network_policy(LOW, HIGH, **{name: 0.0})
+            network_policy(LOW, HIGH, **{name: 0.0})
     with pytest.raises(ValueError, match="steps must be at least 1, got 0"):
-        cj.network_policy(LOW, HIGH, steps=0)
+        network_policy(LOW, HIGH, steps=0)
 
 
 def test_double_precision_is_kept(problem):
