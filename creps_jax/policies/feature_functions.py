@@ -39,7 +39,7 @@ a hundred bandwidths apart, and only the nearest one has a weight."""
 
 
 _FARTHEST = 1e17
-"""The same for a kernel, where squares of several variables are added."""
+"""Largest distance from the middle of the range for a kernel, which adds squares of several variables."""
 _JITTER = 1e-6
 """Added to the kernel matrix of the inducing contexts, whose smallest eigenvalues are below the rounding."""
 
@@ -203,7 +203,7 @@ def _radical_inverse(index: np.ndarray, base: int) -> np.ndarray:
     return result
 
 
-@functools.lru_cache
+@functools.lru_cache(maxsize=8)
 def _inverse_root(num: int, scale: tuple[float, ...]) -> np.ndarray:
     """Return the inverse root of the kernel matrix of the inducing contexts, scaled to bandwidths of one."""
     points = (2.0 * inducing_contexts(len(scale), num) - 1.0) * np.array(scale)

@@ -57,6 +57,13 @@ class Features:
 
         dim = np.size(low)
         kind = self._kind(dim)
+        if self.degree is not None and kind != "polynomial":
+            raise ValueError(f"degree must be None for {kind} features, got {self.degree}")
+        if kind == "polynomial" and (self.num_centers, self.bandwidth) != (None, None):
+            raise ValueError(
+                "num_centers and bandwidth must be None for polynomial features, got "
+                f"{self.num_centers} and {self.bandwidth}"
+            )
         if kind == "linear":
             return linear_features(dim)
         if kind == "polynomial":

@@ -64,12 +64,17 @@ def _release_from_the_world(spec: mujoco.MjSpec) -> None:
     names = {tendon.name for tendon in tendons}
     delete(
         spec,
-        [each for each in spec.equalities if _holds_to_world(each, spec) or names & {each.name1, each.name2}],
+        [each for each in spec.equalities if _holds_to_world(each, spec) or _couples(each, names)],
         [each for each in spec.actuators if each.trntype == _TENDON and each.target in names],
         tendons,
     )
     for body in spec.bodies:
         body.gravcomp = 0.0
+
+
+def _couples(equality: mujoco.MjsEquality, tendons: set[str]) -> bool:
+    """Return whether a constraint couples one of some tendons; joints may have the same names."""
+    return equality.type == mujoco.mjtEq.mjEQ_TENDON and bool(tendons & {equality.name1, equality.name2})
 
 
 def _is_of_world(tendon: mujoco.MjsTendon) -> bool:

@@ -72,11 +72,14 @@ def checked_state(settings: CrepsSettings, state: CrepsState) -> CrepsState:
     return state._replace(policy=policy)
 
 
-def checked_archive_size(settings: CrepsSettings, theta_dim: int) -> int:
-    """Return the size of the archive, after checking that it is not too small."""
+def checked_archive_size(settings: CrepsSettings, theta_dim: int, *, is_linear: bool) -> int:
+    """Return the size of the archive, after checking that it is not too small.
+
+    The policy has a coefficient for each feature and parameter only if it is linear in the features.
+    """
     num_features, num_baseline = settings.kind.features.size, settings.baseline_features.size
     num_fitted, size = num_features + theta_dim, settings.archive_size
-    for_many = samples_for_many_features(num_features, theta_dim)
+    for_many = samples_for_many_features(num_features, theta_dim) if is_linear else 0
     if size is None:
         return max(_DEFAULT_SAMPLES * max(num_fitted, num_baseline), for_many)
     if size < num_fitted:

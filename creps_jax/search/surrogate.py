@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -27,6 +28,7 @@ from creps_jax.search.surrogate_update import (
     SurrogateSettings,
     SurrogateState,
     default_archive_size,
+    least_samples,
     num_context_columns,
     surrogate_update,
 )
@@ -82,13 +84,13 @@ def surrogate(
 ) -> Surrogate:
     """Set up policy search by a quadratic model of the reward, with contextual REPS where the model is bad.
 
-    The model of the reward is quadratic in the parameters, around the mean of the policy. It is fitted to
-    the last samples, and to older ones that the policy could still have drawn. Rewards far below the others
+    The model of the reward is quadratic in the parameters, around the mean of the policy. It is fitted to the
+    last samples, and to older ones that the policy could still have drawn. Rewards far below the others
     (falls) and samples far from the model are left out. The mean moves to the maximum of the model within
-    `kl_bound`, the covariance towards the inverse of its curvature within a smaller bound. While steps go in
-    one direction the spread grows, otherwise it shrinks. On quadratics the search needs 6 to 23 % of the
-    episodes of contextual REPS with `bounded_ml()`, on their roots half of them. If the model explains less
-    than `gate`, the update is that of contextual REPS.
+    `kl_bound`, the covariance towards the inverse of its curvature within a smaller bound. Then, outside of
+    both bounds, the spread grows while steps go in one direction, and shrinks otherwise. On quadratics the
+    search needs 6 to 23 % of the episodes of contextual REPS with `bounded_ml()`, on their roots half of
+    them. If the model explains less than `gate`, the update is that of contextual REPS.
 
     Args:
         policy_features: Features varphi(s) that the mean of the Gaussian policy is linear in.
@@ -100,7 +102,8 @@ def surrogate(
         archive_size: Number L of the last samples that are kept; by default at least twice the number of
             coefficients of the model, and up to 18 times that number or 2000, which reduces the effect of
             noise. With fewer samples than coefficients, the curvature has no products of different
-            parameters.
+            parameters. With less than two for each policy feature and parameter, the model is never used:
+            `init` warns.
         ridge: As in `creps`; the model has a penalty of its own, chosen by cross-validation.
         m_step: Fit of the policy where the model is not used, `bounded_ml()` by default.
         significance: As in `creps`.
@@ -139,8 +142,16 @@ def init(settings: SurrogateSettings, policy: Any) -> SurrogateState:
     state = contextual_reps.init(settings, policy)
     dim = state.policy.coef.shape[1]
     archive = state.archive
+    num_context = num_context_columns(num_baseline)
+    least = least_samples(dim, num_features, num_context)
+    if settings.archive_size is not None and settings.archive_size < least:
+        warnings.warn(
+            f"archive_size should be at least {least}, with which the model of the reward can be used, got "
+            f"{settings.archive_size}: all updates will be those of contextual REPS",
+            stacklevel=2,
+        )
     if settings.archive_size is None:
-        size = default_archive_size(dim, num_features, num_context_columns(num_baseline))
+        size = default_archive_size(dim, num_features, num_context)
         archive = empty_archive(size, settings.kind.features.context_dim, dim, state.policy.coef.dtype)
     return SurrogateState(
         state.policy, archive, state.iteration, jnp.zeros((dim, num_features), state.policy.coef.dtype)

@@ -166,7 +166,7 @@ def _ridge(columns: Array, blocks: tuple[int, ...], context: Array, reward: Arra
     num = jnp.maximum(jnp.sum(kept, dtype=reward.dtype), 1.0)
     root = jnp.where(kept, 1.0, 0.0) / jnp.sqrt(num)
     # The part of the context is not penalised: it is removed from rewards and columns.
-    context = (root[:, None] * context) @ whitener(context, kept)
+    context = exact_dot(root[:, None] * context, whitener(context, kept))
     num_context = jnp.sum(jnp.any(context != 0, axis=0), dtype=reward.dtype)
 
     def removed(values: Array) -> Array:

@@ -86,10 +86,21 @@ class SurrogateInfo(NamedTuple):
 
 def default_archive_size(theta_dim: int, num_features: int, num_context: int) -> int:
     """Return the size of an archive with enough samples for the model, and more where noise needs them."""
-    unknowns = num_unknowns(theta_dim, num_features, num_context)
-    if unknowns > _MOST_COLUMNS:
-        unknowns = theta_dim * (1 + num_features) + num_context
+    unknowns, _ = _coefficients(theta_dim, num_features, num_context)
     return max(10 * (num_features + theta_dim), 2 * unknowns, min(18 * unknowns, _MOST_SAMPLES))
+
+
+def _coefficients(theta_dim: int, num_features: int, num_context: int) -> tuple[int, bool]:
+    """Return the number of coefficients of the model, and whether it has products of parameters."""
+    whole = num_unknowns(theta_dim, num_features, num_context)
+    if whole <= _MOST_COLUMNS:
+        return whole, True
+    return theta_dim * (1 + num_features) + num_context, False
+
+
+def least_samples(theta_dim: int, num_features: int, num_context: int) -> int:
+    """Return the least number of samples with which the model is used."""
+    return _SAMPLES_OF_SLOPE * theta_dim * num_features + num_context
 
 
 def surrogate_update(
@@ -100,26 +111,29 @@ def surrogate_update(
     num_baseline = settings.baseline_features.size
     fallback, info = lax.optimization_barrier(_bounded_update(settings, kl_bound, state))
     model, moved, features, is_valid, is_smooth = _modelled(settings, kl_bound, state)
+    theta_dim, num_features = path.shape
+    least = least_samples(theta_dim, num_features, num_context_columns(num_baseline))
     is_good = (
         (model.r2 >= settings.gate)
         & is_smooth
         & is_usable(settings.kind, moved.policy)
         & jnp.all(jnp.isfinite(moved.path))
         & info.dual.is_informative
-        & (model.num_used >= _SAMPLES_OF_SLOPE * path.size + num_context_columns(num_baseline))
+        & (model.num_used >= least)
     )
     chosen = jax.tree.map(lambda new, other: jnp.where(is_good, new, other), moved.policy, fallback)
     rest = (1.0 - path_decay(path.shape[0])) * path
     kind = settings.kind
     entropy = kind.entropy(chosen)
     policy_kl = mean_over(kind.kl(chosen, policy, features), is_valid)
+    common = info._replace(
+        entropy=entropy,
+        is_updated=info.is_updated | is_good,
+        policy_kl=jnp.where(is_good, policy_kl, info.policy_kl),
+        unsupported_loss=jnp.where(is_good, 0.0, info.unsupported_loss),
+    )
     info = SurrogateInfo(
-        *info._replace(
-            entropy=entropy,
-            is_updated=info.is_updated | is_good,
-            policy_kl=jnp.where(is_good, policy_kl, info.policy_kl),
-            unsupported_loss=jnp.where(is_good, 0.0, info.unsupported_loss),
-        ),
+        **common._asdict(),
         is_by_model=is_good,
         model_r2=model.r2,
         num_fitted=model.num_used,
@@ -159,7 +173,7 @@ def _modelled(
     columns = context_columns(baseline)
     z = jnp.where(is_valid[:, None], whitened(policy, features, theta), 0.0)
     size, dim = theta.shape
-    unknowns = num_unknowns(dim, features.shape[1], columns.shape[1])
+    unknowns, has_products = _coefficients(dim, features.shape[1], columns.shape[1])
     recent = _recency(archive) < int(_ENOUGH * unknowns)
     is_near = jnp.mean(z**2, axis=1) <= _NEAR
     is_used = is_valid & (recent | is_near)
@@ -172,7 +186,7 @@ def _modelled(
         columns,
         reward,
         is_used,
-        has_products=unknowns <= min(_MOST_COLUMNS, size),
+        has_products=has_products and unknowns <= size,
     )
     theta_size = jnp.max(jnp.abs(theta), axis=0)
     theta_size = jnp.where(theta_size > 0, theta_size, 1.0)

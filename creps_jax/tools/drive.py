@@ -21,7 +21,13 @@ from creps_jax.tools.play import load_walking_policy, robot_of, save_film
 from creps_jax.tools.robots import is_spec
 from creps_jax.tools.video import Clip
 from creps_jax.walking.controller import Walker
-from creps_jax.walking.gaits import COMMAND_NAMES, command_range, learned_walker
+from creps_jax.walking.gaits import (
+    COMMAND_NAMES,
+    command_range,
+    is_steered,
+    learned_walker,
+    limited_command,
+)
 
 COLUMNS = ("time", *COMMAND_NAMES)
 _LONGEST = 600.0
@@ -122,13 +128,20 @@ def drive_by_script(
 
 
 def beyond_range(learned: Learned, commands: np.ndarray) -> list[str]:
-    """Return a note for each axis on which commands (n, 3) are beyond what a policy has learned."""
-    axes = zip(COMMAND_NAMES, commands.T, *command_range(learned), strict=True)
+    """Return a note if commands (n, 3) are beyond what a policy has learned, with the farthest of them."""
+    low, high = command_range(learned)
+    if is_steered(learned):
+        limits = (jnp.asarray(low), jnp.asarray(high))
+        followed = np.asarray(jax.vmap(limited_command, (0, None, None))(jnp.asarray(commands), *limits))
+    else:
+        followed = np.clip(commands, low, high)
+    apart = np.abs(commands - followed).max(axis=1)
+    farthest = int(np.argmax(apart))
+    if apart[farthest] < 1e-3:
+        return []
     return [
-        f"note: {name} is limited to the learned range, {low:g} to {high:g}; the script asks for "
-        f"{asked.min():g} to {asked.max():g}"
-        for name, asked, low, high in axes
-        if asked.min() < low or asked.max() > high
+        "note: commands beyond what was learned are reduced, such as "
+        f"{in_words(commands[farthest])} to {in_words(followed[farthest])}"
     ]
 
 

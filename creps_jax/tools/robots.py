@@ -77,7 +77,7 @@ def _last_changes(path: str) -> tuple[int, ...]:
 
 @functools.lru_cache(maxsize=16)
 def _read_spec(path: str, _: tuple[int, ...]) -> RobotRanges:
-    """Read a robot once in a process, unless its files were written again."""
+    """Read a robot once in a process, unless its description or its model file was written again."""
     robot: Humanoid = humanoid_from_toml(path)
     if robot.name in ROBOTS:
         raise UserError(f"{path} must give its robot a name of its own, got {robot.name!r}")

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 
 from creps_jax.numerics.linalg import safe_cholesky
 from creps_jax.policies.features import FeatureMap
-from creps_jax.policies.gaussian import LinearGaussian, sample
+from creps_jax.policies.gaussian import LinearGaussian, sample_rows
 from creps_jax.search.archive import Batch
 from creps_jax.search.base import Search
 
@@ -60,9 +60,7 @@ def _policy(state: State) -> LinearGaussian:
 
 
 def _ask(features: FeatureMap, key: jax.Array, state: State, contexts: ArrayLike) -> jax.Array:
-    contexts = jnp.asarray(contexts)
-    keys = jax.random.split(key, len(contexts))
-    return jax.vmap(sample, (0, None, 0))(keys, _policy(state), features(contexts))
+    return sample_rows(key, _policy(state), features(jnp.asarray(contexts)))
 
 
 def _tell(features: FeatureMap, state: State, batch: Batch) -> tuple[State, Info]:

@@ -4,8 +4,8 @@
 
 Prints a table for each task: the regret of the mean policy on a grid of contexts without noise, as the median
 of the trials with quartiles, the episodes of a trial, and the seconds of all trials, with compilation. Draws
-the regrets of all tasks as one figure. `random` and `CMA-ES x 4` search for the parameters at four fixed
-contexts; `random` varies the coefficients of the policy.
+the regrets of all tasks as one figure. `random` varies the coefficients of the policy, and is judged at
+four fixed contexts; `CMA-ES x 4` searches for the parameters at each of them.
 """
 
 import dataclasses
@@ -234,7 +234,7 @@ def random_search(problem: Problem, keys: jax.Array) -> tuple[np.ndarray, np.nda
         first = (problem.start.coef, jnp.asarray(-jnp.inf), jnp.asarray(size))
         return lax.scan(one, first, jax.random.split(key, steps))[1]
 
-    kept = np.unique(np.linspace(1, steps, min(steps, NUM_EVALUATED)).round().astype(int))
+    kept = evaluated(steps)
     return num * kept, np.asarray(run(keys)[:, kept - 1])
 
 
@@ -257,7 +257,7 @@ def _separate_cma(problem: Problem, key: jax.Array) -> tuple[np.ndarray, np.ndar
     rewards = jax.jit(jax.vmap(partial(_reward, problem.task)))
     per_step = sum(search.popsize for search in searches)
     steps = max(1, problem.episodes // per_step)
-    kept = np.unique(np.linspace(1, steps, min(steps, NUM_EVALUATED)).round().astype(int))
+    kept = evaluated(steps)
     coefs = []
     for step in range(1, steps + 1):
         asked = [np.asarray(search.ask()) for search in searches]
@@ -270,6 +270,11 @@ def _separate_cma(problem: Problem, key: jax.Array) -> tuple[np.ndarray, np.ndar
             means = np.stack([search.mean for search in searches])
             coefs.append(np.linalg.lstsq(features, means, rcond=None)[0])
     return per_step * kept, np.stack(coefs)
+
+
+def evaluated(steps: int) -> np.ndarray:
+    """Return the numbers of the steps after which a search is evaluated."""
+    return np.unique(np.linspace(1, steps, min(steps, NUM_EVALUATED)).round().astype(int))
 
 
 def _reward(task: Any, key: jax.Array, context: jax.Array, theta: jax.Array) -> jax.Array:

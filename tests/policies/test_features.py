@@ -381,6 +381,20 @@ def test_kernels_that_cannot_be_are_named(changes, match):
         kernel_features(**({"low": 0.0, "high": 1.0, "num": 5} | changes))
 
 
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"kind": "rbf", "degree": 3},
+        {"kind": "linear", "degree": 2},
+        {"num_centers": 4, "degree": 3},
+        {"kind": "polynomial", "bandwidth": 0.5},
+    ],
+)
+def test_settings_of_another_kind_of_features_are_refused(settings):
+    with pytest.raises(ValueError, match=r"must be None for (rbf|linear|polynomial) features, got"):
+        Features(**settings).make(0.0, 1.0)
+
+
 @pytest.mark.parametrize(("dim", "size"), [(1, 5), (2, 9), (3, 20), (4, 15), (5, 21)])
 def test_the_default_features_depend_on_the_number_of_contexts(dim, size):
     low, high = (-1.0,) * dim, (1.0,) * dim

@@ -217,3 +217,11 @@ def test_couplings_within_the_robot_are_kept(tmp_path):
     assert robot.model.ntendon == 1 and robot.model.neq == 3
     kinds = [mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtEq.mjEQ_WELD, mujoco.mjtEq.mjEQ_TENDON]
     assert robot.model.eq_type.tolist() == [int(kind) for kind in kinds]
+
+
+def test_a_coupling_of_a_joint_that_has_the_name_of_a_tendon_of_the_world_is_kept(tmp_path):
+    tendon = CRANE.replace('name="crane"', 'name="head"')
+    assert tendon != CRANE
+    coupling = '<equality><joint joint1="head" joint2="left_shoulder"/></equality>'
+    robot = read(tmp_path, [*SITES, before_actuators(f"<tendon>{tendon}</tendon>{coupling}")])
+    assert robot.model.ntendon == 0 and robot.model.neq == 1

@@ -9,7 +9,7 @@ import pytest
 
 import creps_jax as cj
 from creps_jax.search.surrogate_fit import fit_quadratic
-from creps_jax.search.surrogate_update import surrogate_update
+from creps_jax.search.surrogate_update import SurrogateInfo, surrogate_update
 
 DIM, FEATURES = 4, cj.linear_features(1)
 SEARCH = cj.surrogate(FEATURES, archive_size=120)
@@ -214,3 +214,30 @@ def test_states_of_another_search_are_refused():
         SEARCH.policy(other.init(START))
     with pytest.raises(ValueError, match="importance must be None for a surrogate"):
         SEARCH.with_settings(importance=cj.Importance())
+
+
+def test_an_archive_too_small_for_the_model_is_warned_of():
+    features = cj.linear_features(2)
+    start = cj.start_policy(features, 20)
+    with pytest.warns(UserWarning, match=r"at least 130, with which the model .* can be used, got 129"):
+        cj.surrogate(features, archive_size=129).init(start)
+
+
+def test_a_large_model_without_products_leaves_out_old_samples_far_from_the_policy(key):
+    # 40 parameters would have 780 products: the model has 40 curvatures instead.
+    features = cj.linear_features(2)
+    search = cj.surrogate(features)
+    state = search.init(cj.start_policy(features, 40))
+    size = len(state.archive.batch.reward)
+    contexts = np.random.default_rng(0).uniform(size=(size, 2)).astype(np.float32)
+    thetas = search.ask(key, state, contexts)
+    # All but the last 300 samples are far from the policy.
+    thetas = np.array(thetas)
+    thetas[:-300] *= 10.0
+    rewards = -np.sum((thetas - 1.0) ** 2, axis=1)
+    _, info = search.tell(state, cj.Batch(contexts, thetas, rewards))
+    assert 300 <= int(info.num_fitted) + int(info.num_left_out) < size // 2
+
+
+def test_the_diagnostics_begin_with_those_of_contextual_reps():
+    assert SurrogateInfo._fields[: len(cj.CrepsInfo._fields)] == cj.CrepsInfo._fields

@@ -16,6 +16,7 @@ import creps_jax as cj
 from creps_jax.contexts import uniform_contexts
 from creps_jax.policies.features import FeatureMap, linear_features, polynomial_features, rbf_features
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
+from creps_jax.policies.network import network_policy, start_network
 from creps_jax.search import creps as creps_functions
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import creps
@@ -179,6 +180,14 @@ def test_many_features_for_the_archive_are_warned_of(num_centers, archive_size):
         warnings.simplefilter("error")
         creps(features, FEATURES, archive_size=archive_size + 1).init(start)
         assert len(creps(features, FEATURES).init(start).archive.batch.reward) == archive_size + 1
+
+
+def test_the_features_of_a_network_are_not_its_coefficients():
+    kind = network_policy((-1.0,) * 5, (1.0,) * 5)
+    start = start_network(jax.random.key(0), kind.features, 10)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        creps(kind, archive_size=400).init(start)
 
 
 def test_few_features_are_not_warned_of():

@@ -357,8 +357,8 @@ def test_mistakes_are_one_clear_line(folder, capsys):
         save(folder / f"{name}.npz", policy)
     (folder / "file").touch()
     (folder / "folder.h").mkdir()
-    for name in ("walk.h", "drive.c"):
-        (folder / name).touch()
+    (folder / "walk.h").touch()
+    (folder / "drive.c").write_text('#include "drive.h"')
     walk = ["--to", "walk.csv", "--speed", "0.3"]
     steered = ["--policy", str(STEERED)]
     for match, arguments in (

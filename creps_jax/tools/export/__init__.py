@@ -84,7 +84,7 @@ def export(
 def _check_header(to: Path, ending: str) -> None:
     """Check that a header of a policy and the header of a whole walk do not overwrite each other."""
     other = to.with_suffix(".c" if ending == ".h" else ".h")
-    if ending == ".h" and other.exists():
+    if ending == ".h" and other.exists() and f'#include "{to.name}"' in other.read_text("utf-8", "ignore"):
         raise UserError(f"--to {to} is the name of the header of {other}, name another file")
     if ending in _WHOLE_WALK and other.exists() and not to.exists():
         raise UserError(f"--to {to} would overwrite {other} with the header of the walk, name another file")

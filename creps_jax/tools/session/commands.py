@@ -39,8 +39,8 @@ class New:
         exploration: Factor of the policy's standard deviations; 1 by default.
         batch_size: Number of trials for an update; 10 by default.
         archive_size: Number of last trials to learn from; by default five batches, and at least twice the
-            number of features and parameters; with more than 10 features, also three for each feature and
-            parameter.
+            number of features and parameters; with more than 10 features, also three for each
+            coefficient, features times parameters.
         kl_bound: Bound on the relative entropy of the weights of trials, in nats; 0.5 by default.
         seed: Seed of contexts and exploration; 0 by default.
     """

@@ -91,8 +91,8 @@ class Settings:
         cov_kl_bound: the same for the covariance, nats.
         batch_size: number of trials for an update.
         archive_size: number of last trials to learn from; by default five batches, and at least twice the
-            number of features and parameters; with more than 10 features, also three for each feature and
-            parameter.
+            number of features and parameters; with more than 10 features, also three for each
+            coefficient, features times parameters.
         seed: of the contexts and of the exploration.
         first_policy: the first policy, in place of start and spread of the parameters.
         task: the task of a saved policy; learning does not depend on it.
