@@ -640,7 +640,7 @@ ROWS = {
         policy_features=features(),
         baseline_features=features(),
         kl_bound=number(0.5, above=0.0),
-        archive_size=count(8),
+        archive_size=count(16),
         ridge=number(1e-4, least=0.0),
         m_step=function(weighted_ml),
         gate=number(0.8, above=0.0),

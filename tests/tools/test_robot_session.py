@@ -430,7 +430,15 @@ def broken(*path, **values) -> dict:
         (broken("parameters", 0, spread=0.0), "spread of speed must be above zero, got 0"),
         (broken("parameters", 0, spread=1e-60), "in single precision: std must be above zero"),
         (broken("features", kind="cubic"), "features must be one of linear, polynomial, rbf, got 'cubic'"),
-        (broken("features", kind="polynomial", degree=0), "degree must be at least 1, got 0"),
+        (
+            broken("features", kind="polynomial", degree=0, num_centers=None),
+            "degree must be at least 1, got 0",
+        ),
+        (
+            broken("features", kind="polynomial"),
+            "num_centers and bandwidth must be None for polynomial features",
+        ),
+        (broken("features", degree=2), "degree must be None for rbf features, got 2"),
         (broken("features", degree=2.5), r"features\.degree must be a whole number, got 2\.5"),
         (broken("features", num_centers=0), "num_centers must be at least 1, got 0"),
         (broken("features", num_centers=2.5), r"features\.num_centers must be a whole number, got 2\.5"),

@@ -81,9 +81,9 @@ def complete(settings: Settings) -> Settings:
         # Products of three variables are too many features for the hundreds of trials of a session.
         features = dataclasses.replace(features, degree=2)
     settings = dataclasses.replace(settings, features=features)
+    num_features, theta_dim = feature_map(settings).size, len(settings.parameters)
     if settings.archive_size is None:
         # An update needs as many trials as there are features and parameters.
-        num_features, theta_dim = feature_map(settings).size, len(settings.parameters)
         least = max(2 * (num_features + theta_dim), samples_for_many_features(num_features, theta_dim))
         settings = dataclasses.replace(settings, archive_size=max(5 * settings.batch_size, least))
     if settings.first_policy is not None:
