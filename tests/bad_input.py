@@ -584,6 +584,14 @@ PHYSICS = {
     **{of.__name__: traced(of, use=lambda _: (), x=VECTOR) for of in OF_VECTORS},
 }
 
+
+def update_once(search: Any) -> Any:
+    """Return the shapes of the policy after an update."""
+    return jax.eval_shape(
+        lambda: search.tell(search.init(POLICY), cj.Batch(CONTEXTS, THETAS, REWARDS))[0].policy
+    )
+
+
 ROWS = {
     **MOTION,
     **PHYSICS,
@@ -621,9 +629,7 @@ ROWS = {
     "context_grid": row(cj.context_grid, low=vector(0.0), high=vector(1.0), num=count(3, least=2)),
     "creps": row(
         cj.creps,
-        use=lambda algorithm: jax.eval_shape(
-            lambda: algorithm.tell(algorithm.init(POLICY), cj.Batch(CONTEXTS, THETAS, REWARDS))[0].policy
-        ),
+        use=update_once,
         policy_features=features(),
         baseline_features=features(),
         kl_bound=number(0.5, above=0.0),
@@ -634,9 +640,7 @@ ROWS = {
     ),
     "surrogate": row(
         cj.surrogate,
-        use=lambda search: jax.eval_shape(
-            lambda: search.tell(search.init(POLICY), cj.Batch(CONTEXTS, THETAS, REWARDS))[0].policy
-        ),
+        use=update_once,
         policy_features=features(),
         baseline_features=features(),
         kl_bound=number(0.5, above=0.0),

@@ -14,7 +14,7 @@ from jax import lax
 
 from creps_jax import checks
 from creps_jax.numerics.linalg import exact_dot
-from creps_jax.typing import Array, Float
+from creps_jax.typing import Array, Float, VectorLike
 
 __all__ = [
     "Kernel",
@@ -101,9 +101,9 @@ class ScaledPolynomial:
     def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
         """Return the features of a context."""
         context = _checked_context(context, len(self.low))
-        low, high = np.asarray(self.low), np.asarray(self.high)
-        # Halves: the difference of large numbers overflows.
-        middle, half = (jnp.asarray(0.5 * high + sign * 0.5 * low, context.dtype) for sign in (1.0, -1.0))
+        middle, half = (
+            jnp.asarray(numbers, context.dtype) for numbers in middle_and_half(self.low, self.high)
+        )
         return Polynomial(len(self.low), self.degree)((context - middle) / half)
 
 
@@ -163,11 +163,9 @@ class Kernel:
     def __call__(self, context: Float[Array, " s"]) -> Float[Array, " m"]:
         """Return the features of a context."""
         context = _checked_context(context, len(self.low))
-        low, high, bandwidth = (np.asarray(numbers) for numbers in (self.low, self.high, self.bandwidth))
-        # Halves: the difference of large numbers overflows.
-        middle, half = 0.5 * high + 0.5 * low, 0.5 * high - 0.5 * low
-        ratio = half / bandwidth
-        points = (2.0 * inducing_contexts(low.size, self.num) - 1.0) * ratio
+        middle, half = middle_and_half(self.low, self.high)
+        ratio = half / np.asarray(self.bandwidth)
+        points = (2.0 * inducing_contexts(half.size, self.num) - 1.0) * ratio
         root = _inverse_root(self.num, tuple(ratio.tolist()))
         middle, half, ratio, points, root = (
             jnp.asarray(numbers, context.dtype) for numbers in (middle, half, ratio, points, root)
@@ -176,6 +174,14 @@ class Kernel:
         distance = scaled[None, :] - points
         covariance = jnp.exp(-0.5 * jnp.sum(distance**2, axis=1))
         return jnp.concatenate([jnp.ones_like(covariance[:1]), exact_dot(covariance, root)])
+
+
+def middle_and_half(
+    low: VectorLike, high: VectorLike
+) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, " s"]]:
+    """Return the middle of a range and half its size; the difference of large numbers would overflow."""
+    lows, highs = 0.5 * np.asarray(low), 0.5 * np.asarray(high)
+    return highs + lows, highs - lows
 
 
 def inducing_contexts(dim: int, num: int) -> np.ndarray:

@@ -18,6 +18,7 @@ from creps_jax.policies.feature_functions import (
     Quadratic,
     Radial,
     grid_of_centers,
+    middle_and_half,
 )
 from creps_jax.typing import Array, Float, VectorLike
 
@@ -239,8 +240,7 @@ def kernel_features(
     lows, highs = checks.ends(low, high)
     if num > _MOST_POINTS:
         raise ValueError(f"num must be at most {_MOST_POINTS} inducing contexts, got {num}")
-    # Halves: the difference of large numbers overflows.
-    halves = 0.5 * highs - 0.5 * lows
+    _, halves = middle_and_half(lows, highs)
     widths = 1.5 * halves if bandwidth is None else checks.vector("bandwidth", bandwidth)
     if widths.shape not in ((), (1,), lows.shape):
         raise ValueError(f"bandwidth must be a number or as long as low, {lows.size}, got {bandwidth}")

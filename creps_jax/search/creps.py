@@ -79,7 +79,7 @@ class Creps(Search):
     def settings(self) -> CrepsSettings | None:
         """The settings that the functions share; None if one of the functions was replaced."""
         functions = (self.init, self.ask, self.tell, self.policy, self.mean)
-        owners = [_settings_of(function) for function in functions]
+        owners = [self._settings_of(function) for function in functions]
         return owners[0] if all(owner is owners[0] for owner in owners) else None
 
     @functools.cached_property
@@ -99,7 +99,7 @@ class Creps(Search):
         """
         if self.settings is None:
             return dataclasses.replace(self)
-        return _algorithm(dataclasses.replace(self.settings, kl_bound=checked_kl_bound(traced)))
+        return self.of_settings(dataclasses.replace(self.settings, kl_bound=checked_kl_bound(traced)))
 
     def with_settings(self, **changes: Any) -> "Creps":
         """Return the algorithm with other values of some of the fields of `settings`.
@@ -109,11 +109,14 @@ class Creps(Search):
                 out of its range.
         """
         if self.settings is None:
-            raise ValueError("the algorithm must be made by creps() to change its settings, got another one")
+            maker = type(self).__name__.lower()
+            raise ValueError(
+                f"the algorithm must be made by {maker}() to change its settings, got another one"
+            )
         fields = {
             field.name: getattr(self.settings, field.name) for field in dataclasses.fields(self.settings)
         }
-        return _algorithm(checked_settings(**(fields | changes)))
+        return self.of_settings(self._checked(**(fields | changes)))
 
     def with_kl_bound(self, kl_bound: ScalarLike) -> "Creps":
         """Return the algorithm with another KL bound; nothing is compiled anew.
@@ -125,6 +128,30 @@ class Creps(Search):
             ValueError: If the bound is not a number above 0, or one of the functions was replaced.
         """
         return self.with_settings(kl_bound=kl_bound)
+
+    @classmethod
+    def of_settings(cls, settings: Any) -> Any:
+        """Return the functions of this kind of search with these settings."""
+        # Now, while an algorithm may be alive that shares the programs, such as the one that this replaces.
+        _ = settings.programs
+        return cls(*(_with_settings(settings, function) for function in cls._functions()))
+
+    @classmethod
+    def _settings_of(cls, function: Callable) -> Any:
+        """Return the settings that `of_settings` has given to a function; None for any other function."""
+        is_own = isinstance(function, partial) and function.func in cls._functions()
+        return function.args[0] if is_own else None
+
+    # What another search of the same settings replaces.
+    @staticmethod
+    def _functions() -> tuple[Callable, ...]:
+        """Return the functions of the record, whose first argument are the settings."""
+        return init, ask, tell, policy, mean
+
+    @staticmethod
+    def _checked(**fields: Any) -> CrepsSettings:
+        """Return settings, after checking each of them."""
+        return checked_settings(**fields)
 
 
 @checks.arguments
@@ -182,7 +209,7 @@ def creps(
         importance=importance,
         significance=significance,
     )
-    return _algorithm(settings)
+    return Creps.of_settings(settings)
 
 
 def init(settings: CrepsSettings, policy: Any) -> CrepsState:
@@ -293,21 +320,8 @@ def mean(settings: CrepsSettings, policy: Any, contexts: ArrayLike) -> Array:
     return thetas
 
 
-def _algorithm(settings: CrepsSettings) -> Creps:
-    """Return the functions of this module with these settings."""
-    # Now, while an algorithm may be alive that shares the programs, such as the one that this one replaces.
-    _ = settings.programs
-    return Creps(*(with_settings(settings, function) for function in (init, ask, tell, policy, mean)))
-
-
-def with_settings(settings: CrepsSettings, function: Callable) -> Callable:
-    """Return a function of this module with its first argument, and with its docstring for `help`."""
+def _with_settings(settings: CrepsSettings, function: Callable) -> Callable:
+    """Return a function with its first argument, and with its docstring for `help`."""
     given = partial(function, settings)
     given.__doc__ = function.__doc__
     return given
-
-
-def _settings_of(function: Callable) -> CrepsSettings | None:
-    """Return the settings that `with_settings` has given to a function; None for any other function."""
-    is_own = isinstance(function, partial) and function.func in (init, ask, tell, policy, mean)
-    return function.args[0] if is_own else None

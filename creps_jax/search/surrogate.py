@@ -1,10 +1,8 @@
 """Policy search by a quadratic model of the reward, which falls back to contextual REPS: ask and tell."""
 
 import dataclasses
-import functools
 import warnings
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -22,7 +20,7 @@ from creps_jax.search.input_checks import (
     checked_batch,
     checked_state,
 )
-from creps_jax.search.settings import checked_kl_bound, checked_settings, policy_kind
+from creps_jax.search.settings import checked_settings, policy_kind
 from creps_jax.search.surrogate_update import (
     SurrogateInfo,
     SurrogateSettings,
@@ -44,30 +42,13 @@ _push = jax.jit(push)
 class Surrogate(Creps):
     """The search of `surrogate` as a record of pure functions, see `Search` and `Creps`."""
 
-    @functools.cached_property
-    def settings(self) -> SurrogateSettings | None:
-        """The settings that the functions share; None if one of the functions was replaced."""
-        functions = (self.init, self.ask, self.tell, self.policy, self.mean)
-        owners = [_settings_of(function) for function in functions]
-        return owners[0] if all(owner is owners[0] for owner in owners) else None
+    @staticmethod
+    def _functions() -> tuple[Callable, ...]:
+        return init, ask, tell, policy, mean
 
-    def with_traced(self, traced: Any) -> "Surrogate":
-        """Return the search with another KL bound, or unchanged if one of its functions was replaced."""
-        if self.settings is None:
-            return dataclasses.replace(self)
-        return _search(dataclasses.replace(self.settings, kl_bound=checked_kl_bound(traced)))
-
-    def with_settings(self, **changes: Any) -> "Surrogate":
-        """Return the search with other values of some of the fields of `settings`.
-
-        Raises:
-            ValueError: If one of its functions was replaced, so that it has no settings; or if a value is
-                out of its range.
-        """
-        if self.settings is None:
-            raise ValueError("the search must be made by surrogate() to change its settings, got another one")
-        names = [field.name for field in dataclasses.fields(self.settings)]
-        return _search(_checked(**({name: getattr(self.settings, name) for name in names} | changes)))
+    @staticmethod
+    def _checked(**fields: Any) -> SurrogateSettings:
+        return _checked(**fields)
 
 
 @checks.arguments
@@ -123,7 +104,7 @@ def surrogate(
     optimization for stochastic search and episodic reinforcement learning.
     """
     kind = policy_kind(policy_features, ridge, bounded_ml() if m_step is None else m_step)
-    return _search(
+    return Surrogate.of_settings(
         _checked(
             kind=kind,
             baseline_features=kind.features if baseline_features is None else baseline_features,
@@ -202,14 +183,3 @@ def _checked(*, gate: float | int, **settings: Any) -> SurrogateSettings:
         raise ValueError(f"importance must be None for a surrogate, got {checks.shown(found.importance)}")
     fields = {field.name: getattr(found, field.name) for field in dataclasses.fields(found)}
     return SurrogateSettings(**fields, gate=gate)
-
-
-def _search(settings: SurrogateSettings) -> Surrogate:
-    _ = settings.programs
-    functions = (init, ask, tell, policy, mean)
-    return Surrogate(*(contextual_reps.with_settings(settings, function) for function in functions))
-
-
-def _settings_of(function: Callable) -> SurrogateSettings | None:
-    is_own = isinstance(function, partial) and function.func in (init, ask, tell, policy, mean)
-    return function.args[0] if is_own else None

@@ -11,7 +11,7 @@ import numpy as np
 
 from creps_jax import files
 from creps_jax.errors import UserError
-from creps_jax.policies.learned import Learned, load
+from creps_jax.policies.learned import Learned
 from creps_jax.robots.robot import NAO
 from creps_jax.simulation import c
 from creps_jax.tasks.closed_loop import CONTROL_PERIOD
@@ -117,9 +117,10 @@ def drive_by_script(
         raise UserError(f"a video must be an .mp4 file, got {out}")
     files.check_writable(out.parent)
     commands = read_script(script)
-    walker = load_walker(policy, robot)
+    learned = load_walking_policy(policy, robot, can_steer=True)
+    walker = learned_walker(learned, robot=robot_of(learned, robot))
     say(f"policy: {policy}")
-    for line in beyond_range(load(policy), commands):
+    for line in beyond_range(learned, commands):
         say(line)
     drive = drive_by_commands(walker, commands, seed=seed)
     for line in report(commands, drive):
@@ -161,16 +162,6 @@ def captions(drive: Drive) -> list[str]:
 def in_words(speed: Sequence[float] | np.ndarray) -> str:
     """Write a command or speed (vx, vy, turn rate), m/s and rad/s; zero has no sign."""
     return " ".join(f"{value + 0.0:.2f}" for value in np.round(np.asarray(speed, float), 2))
-
-
-def load_walker(policy: Path, robot: str | None = None) -> Walker:
-    """Load a policy file, and make its walker.
-
-    Raises:
-        UserError: if the file cannot be read, or its policy is no walk, or of another robot.
-    """
-    learned = load_walking_policy(policy, robot, can_steer=True)
-    return learned_walker(learned, robot=robot_of(learned, robot))
 
 
 def drive_by_commands(walker: Walker, commands: np.ndarray, *, seed: int) -> Drive:

@@ -164,26 +164,17 @@ def save(found: Mapping[str, Mapping[str, Curve]], folder: Path) -> None:
 
 def weighted(problem: Problem) -> Search:
     """Make contextual REPS with the paper's fit and update."""
-    return creps(
-        problem.features,
-        problem.features,
-        kl_bound=problem.kl_bound,
-        archive_size=problem.archive_sizes[0],
-        ridge=problem.ridge,
-        significance=None,
-    )
+    return _creps(problem, archive_size=problem.archive_sizes[0], significance=None)
 
 
 def bounded(problem: Problem) -> Search:
     """Make contextual REPS with the bounded fit."""
-    return creps(
-        problem.features,
-        problem.features,
-        kl_bound=problem.kl_bound,
-        archive_size=problem.archive_sizes[1],
-        ridge=problem.ridge,
-        m_step=problem.m_step,
-    )
+    return _creps(problem, archive_size=problem.archive_sizes[1], m_step=problem.m_step)
+
+
+def _creps(problem: Problem, **settings: Any) -> Search:
+    bounds = {"kl_bound": problem.kl_bound, "ridge": problem.ridge}
+    return creps(problem.features, problem.features, **bounds, **settings)
 
 
 def by_model(problem: Problem) -> Search:

@@ -13,19 +13,18 @@ from creps_jax.tools.drive import (
     captions,
     default_policy,
     drive_by_commands,
-    load_walker,
     read_script,
     report,
 )
 from creps_jax.tools.drive_live import Command, LiveRobot
-from creps_jax.walking.gaits import command_range
+from creps_jax.walking.gaits import command_range, learned_walker
 
 SCRIPT = "time,vx,vy,turn\n0,0.2,0,0\n1.5,0,0,0.4\n2,0,0,0\n"
 
 
 @pytest.fixture(scope="module")
 def walker():
-    return load_walker(policies_folder() / "steer.npz")
+    return learned_walker(load(policies_folder() / "steer.npz"))
 
 
 def test_a_script_is_the_command_of_each_control_step(tmp_path):
