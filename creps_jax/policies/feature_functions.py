@@ -165,8 +165,7 @@ class Kernel:
         context = _checked_context(context, len(self.low))
         middle, half = middle_and_half(self.low, self.high)
         ratio = half / np.asarray(self.bandwidth)
-        points = (2.0 * inducing_contexts(half.size, self.num) - 1.0) * ratio
-        root = _inverse_root(self.num, tuple(ratio.tolist()))
+        points, root = self.from_middle() * ratio, self.inverse_root()
         middle, half, ratio, points, root = (
             jnp.asarray(numbers, context.dtype) for numbers in (middle, half, ratio, points, root)
         )
@@ -174,6 +173,15 @@ class Kernel:
         distance = scaled[None, :] - points
         covariance = jnp.exp(-0.5 * jnp.sum(distance**2, axis=1))
         return jnp.concatenate([jnp.ones_like(covariance[:1]), exact_dot(covariance, root)])
+
+    def from_middle(self) -> Float[np.ndarray, "n s"]:
+        """Return the inducing contexts, scaled from the range to -1 to 1."""
+        return 2.0 * inducing_contexts(len(self.low), self.num) - 1.0
+
+    def inverse_root(self) -> Float[np.ndarray, "n n"]:
+        """Return the inverse root of the kernel matrix of the inducing contexts."""
+        _, half = middle_and_half(self.low, self.high)
+        return _inverse_root(self.num, tuple((half / np.asarray(self.bandwidth)).tolist()))
 
 
 def middle_and_half(

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = ["FEATURE_KINDS", "Features"]
 
-FEATURE_KINDS = ("linear", "polynomial", "rbf")
+FEATURE_KINDS = ("linear", "polynomial", "rbf", "kernel")
 """The kinds of features that `Features` can make."""
 
 
@@ -20,19 +20,24 @@ class Features:
     """Settings of features, for runs, sessions and files.
 
     Attributes:
-        kind: One of `FEATURE_KINDS`. None is "polynomial" with a degree, "rbf" with a number of centres or a
-            bandwidth; without any of them, "rbf" for one or two variables and "polynomial" for more.
+        kind: One of `FEATURE_KINDS`. None is "polynomial" with a degree, "kernel" with a number of points,
+            "rbf" with a number of centres or a bandwidth; without any of them, "rbf" for one or two variables
+            and "polynomial" for more.
         num_centers: Number K of RBF centres: one for all context variables, or one for each; None is 5 for
             one variable, 3 along each of two, and 2 along each of more.
-        bandwidth: Width of the RBFs in the units of the context; None is (high - low) / K.
+        bandwidth: Width of the RBFs or the kernel in the units of the context; None is (high - low) / K for
+            RBFs, 0.75 (high - low) for a kernel.
         degree: Largest sum of the exponents in a monomial of polynomial features; None is 3 for three
             variables, and 2 for other numbers of them.
+        num_points: Number of inducing contexts of kernel features, see `kernel_features`; None is 10 for one
+            or two variables, 20 for three, and 30 for more.
     """
 
     kind: str | None = None
     num_centers: int | tuple[int, ...] | None = None
     bandwidth: float | None = None
     degree: int | None = None
+    num_points: int | None = None
 
     def __post_init__(self) -> None:
         # Settings are hashed.
@@ -44,6 +49,8 @@ class Features:
         kind = self._kind(dim)
         if kind == "polynomial":
             return dataclasses.replace(self, kind=kind, degree=self._degree(dim))
+        if kind == "kernel":
+            return dataclasses.replace(self, kind=kind, num_points=self._points(dim))
         return dataclasses.replace(self, kind=kind, num_centers=self._centers(dim))
 
     def make(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
@@ -53,23 +60,31 @@ class Features:
             ValueError: If the kind is unknown, or a setting is out of its range.
         """
         # Settings are read by commands that do not start jax.
-        from creps_jax.policies.features import linear_features, polynomial_features, rbf_features
+        from creps_jax.policies import features
 
         dim = np.size(low)
         kind = self._kind(dim)
         if self.degree is not None and kind != "polynomial":
             raise ValueError(f"degree must be None for {kind} features, got {self.degree}")
+        if self.num_points is not None and kind != "kernel":
+            raise ValueError(f"num_points must be None for {kind} features, got {self.num_points}")
+        if kind == "kernel" and self.num_centers is not None:
+            raise ValueError(f"num_centers must be None for kernel features, got {self.num_centers}")
+        if self.num_points is not None and not 1 <= self.num_points <= features.MOST_POINTS:
+            raise ValueError(f"num_points must be from 1 to {features.MOST_POINTS}, got {self.num_points}")
         if kind == "polynomial" and (self.num_centers, self.bandwidth) != (None, None):
             raise ValueError(
                 "num_centers and bandwidth must be None for polynomial features, got "
                 f"{self.num_centers} and {self.bandwidth}"
             )
         if kind == "linear":
-            return linear_features(dim)
+            return features.linear_features(dim)
         if kind == "polynomial":
-            return polynomial_features(dim, self._degree(dim))
+            return features.polynomial_features(dim, self._degree(dim))
         if kind == "rbf":
-            return rbf_features(low, high, self._centers(dim), bandwidth=self.bandwidth)
+            return features.rbf_features(low, high, self._centers(dim), bandwidth=self.bandwidth)
+        if kind == "kernel":
+            return features.kernel_features(low, high, self._points(dim), bandwidth=self.bandwidth)
         raise ValueError(f"features must be one of {', '.join(FEATURE_KINDS)}, got {self.kind!r}")
 
     def make_baseline(self, low: "VectorLike", high: "VectorLike") -> "FeatureMap":
@@ -88,6 +103,8 @@ class Features:
             return self.kind
         if self.degree is not None:
             return "polynomial"
+        if self.num_points is not None:
+            return "kernel"
         is_radial = dim <= 2 or self.num_centers is not None or self.bandwidth is not None
         return "rbf" if is_radial else "polynomial"
 
@@ -97,3 +114,6 @@ class Features:
 
     def _centers(self, dim: int) -> int | tuple[int, ...]:
         return {1: 5, 2: 3}.get(dim, 2) if self.num_centers is None else self.num_centers
+
+    def _points(self, dim: int) -> int:
+        return {1: 10, 2: 10, 3: 20}.get(dim, 30) if self.num_points is None else self.num_points

@@ -34,7 +34,7 @@ __all__ = [
 
 _MOST_FEATURES = 1_000_000
 """Largest number of monomials, which grows fast: more would fill the memory."""
-_MOST_POINTS = 2000
+MOST_POINTS = 2000
 """Largest number of inducing contexts: the eigenvalues of a larger kernel matrix take minutes."""
 _BANDWIDTHS = (1e-3, 1e3)
 """Least and largest bandwidth of a kernel, relative to the range."""
@@ -238,8 +238,8 @@ def kernel_features(
     Source: Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, Section 8.3.4.
     """
     lows, highs = checks.ends(low, high)
-    if num > _MOST_POINTS:
-        raise ValueError(f"num must be at most {_MOST_POINTS} inducing contexts, got {num}")
+    if num > MOST_POINTS:
+        raise ValueError(f"num must be at most {MOST_POINTS} inducing contexts, got {num}")
     _, halves = middle_and_half(lows, highs)
     widths = 1.5 * halves if bandwidth is None else checks.vector("bandwidth", bandwidth)
     if widths.shape not in ((), (1,), lows.shape):

@@ -388,10 +388,13 @@ def test_kernels_that_cannot_be_are_named(changes, match):
         {"kind": "linear", "degree": 2},
         {"num_centers": 4, "degree": 3},
         {"kind": "polynomial", "bandwidth": 0.5},
+        {"kind": "polynomial", "num_points": 5},
+        {"num_centers": 3, "kind": "rbf", "num_points": 5},
+        {"num_centers": 3, "num_points": 5},
     ],
 )
 def test_settings_of_another_kind_of_features_are_refused(settings):
-    with pytest.raises(ValueError, match=r"must be None for (rbf|linear|polynomial) features, got"):
+    with pytest.raises(ValueError, match=r"must be None for (rbf|linear|polynomial|kernel) features, got"):
         Features(**settings).make(0.0, 1.0)
 
 
@@ -399,3 +402,19 @@ def test_settings_of_another_kind_of_features_are_refused(settings):
 def test_the_default_features_depend_on_the_number_of_contexts(dim, size):
     low, high = (-1.0,) * dim, (1.0,) * dim
     assert Features().make(low, high).size == Features().complete(dim).make(low, high).size == size
+
+
+@pytest.mark.parametrize(("dim", "num"), [(1, 10), (2, 10), (3, 20), (4, 30), (6, 30)])
+def test_settings_make_kernel_features(dim, num):
+    low, high = (-1.0,) * dim, (3.0,) * dim
+    assert Features("kernel").make(low, high) == kernel_features(low, high, num)
+    assert Features("kernel").complete(dim) == Features("kernel", num_points=num)
+    wide = kernel_features(low, high, 4, bandwidth=5.0)
+    assert Features(num_points=4, bandwidth=5.0).make(low, high) == wide
+    assert Features(num_points=4).make_baseline(low, high) == kernel_features(low, high, 4)
+
+
+@pytest.mark.parametrize("num", [0, -1, 2001])
+def test_a_bad_number_of_points_is_named(num):
+    with pytest.raises(ValueError, match=f"num_points must be from 1 to 2000, got {num}"):
+        Features("kernel", num_points=num).make(0.0, 1.0)

@@ -13,6 +13,7 @@ from creps_jax.errors import UserError
 from creps_jax.policies import features as feature_maps
 from creps_jax.policies.features import (
     FeatureMap,
+    kernel_features,
     linear_features,
     polynomial_features,
     quadratic_features,
@@ -49,6 +50,11 @@ FEATURES = {
     "quadratic": (quadratic_features(1), SPEED),
     "polynomial": (polynomial_features(2, 3), Space(("speed", "slope"), (0.1, -5.0), (0.6, 5.0))),
     "rbf per axis": (rbf_features([0, 0], [1, 1], (2, 3)), Space(("x", "y"), (0.0, 0.0), (1.0, 1.0))),
+    "kernel": (kernel_features(0.1, 0.6, 5), SPEED),
+    "kernel per axis": (
+        kernel_features([0, 0], [1, 1], 6, bandwidth=(0.3, 2.0)),
+        Space(("x", "y"), (0.0, 0.0), (1.0, 1.0)),
+    ),
     "own": (CUBIC, SPEED),
 }
 
@@ -64,7 +70,10 @@ def test_a_policy_comes_back_as_it_was_saved(tmp_path, name):
     features, contexts = FEATURES[name]
     policy = make_policy(features, contexts)
     policy.save(tmp_path / "policy.npz")
-    assert_same(cj.load(tmp_path / "policy.npz", features=CUBIC if name == "own" else None), policy)
+    loaded = cj.load(tmp_path / "policy.npz", features=CUBIC if name == "own" else None)
+    assert_same(loaded, policy)
+    grid = cj.context_grid(contexts.low, contexts.high, 5)
+    np.testing.assert_array_equal(loaded.features(grid), policy.features(grid))
 
 
 def test_features_of_a_user_need_a_name_and_come_along(tmp_path):

@@ -20,7 +20,7 @@ import pytest
 from creps_jax.errors import UserError
 from creps_jax.files import load_arrays, policies_folder
 from creps_jax.policies.feature_settings import Features
-from creps_jax.policies.features import linear_features, quadratic_features
+from creps_jax.policies.features import describe, linear_features, quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned, load, save
 from creps_jax.policies.space import Space
@@ -69,6 +69,9 @@ POLICIES = {
         make_policy("straight", Features("linear"), "sigmoid"),
         make_policy("clipped", Features("linear"), "clip"),
         make_policy("curved", Features("polynomial", degree=3), "sigmoid"),
+        make_policy("smooth", Features("kernel", num_points=8), "sigmoid"),
+        make_policy("point", Features("kernel", num_points=1), "clip"),
+        make_policy("near", Features("kernel", num_points=12, bandwidth=0.05), "clip", num_contexts=1),
         make_policy("free", Features("linear"), "none"),
         load(SHIPPED),
     )
@@ -94,7 +97,9 @@ def assert_same(policy: Learned, run) -> None:
     parameters, in_range = run(contexts)
     theta = np.array([policy.theta(*row.tolist()) for row in nearest])
     low, high = np.float32(policy.parameters.low), np.float32(policy.parameters.high)
-    np.testing.assert_array_less(np.abs(parameters - theta) / (high - low), 1e-6)
+    # Kernel features multiply the rounding of covariances by the inverse root of their matrix.
+    tolerance = 3e-5 if describe(policy.features)["kind"] == "kernel" else 1e-6
+    np.testing.assert_array_less(np.abs(parameters - theta) / (high - low), tolerance)
     np.testing.assert_array_equal(in_range, expected)
     if policy.parameters.constraint != "none":
         assert ((parameters >= low) & (parameters <= high)).all()
@@ -230,7 +235,7 @@ def test_features_that_cannot_be_exported_are_named(make):
     features = quadratic_features(1)
     policy = LinearGaussian(np.zeros((2, 3)), np.eye(3))
     with pytest.raises(
-        UserError, match="features must be linear, polynomial or rbf to be exported, got quadratic"
+        UserError, match="features must be linear, polynomial, rbf or kernel to be exported, got quadratic"
     ):
         make(Learned(policy, features, contexts, POLICIES["free"].parameters))
 

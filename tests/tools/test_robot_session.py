@@ -429,7 +429,10 @@ def broken(*path, **values) -> dict:
         ),
         (broken("parameters", 0, spread=0.0), "spread of speed must be above zero, got 0"),
         (broken("parameters", 0, spread=1e-60), "in single precision: std must be above zero"),
-        (broken("features", kind="cubic"), "features must be one of linear, polynomial, rbf, got 'cubic'"),
+        (
+            broken("features", kind="cubic"),
+            "features must be one of linear, polynomial, rbf, kernel, got 'cubic'",
+        ),
         (
             broken("features", kind="polynomial", degree=0, num_centers=None),
             "degree must be at least 1, got 0",
@@ -439,6 +442,16 @@ def broken(*path, **values) -> dict:
             "num_centers and bandwidth must be None for polynomial features",
         ),
         (broken("features", degree=2), "degree must be None for rbf features, got 2"),
+        (broken("features", num_points=5), "num_points must be None for rbf features, got 5"),
+        (
+            broken("features", kind="kernel", num_points=5),
+            "num_centers must be None for kernel features, got",
+        ),
+        (
+            broken("features", kind="kernel", num_points=0, num_centers=None),
+            "num_points must be from 1 to 2000, got 0",
+        ),
+        (broken("features", num_points=2.5), r"features\.num_points must be a whole number, got 2\.5"),
         (broken("features", degree=2.5), r"features\.degree must be a whole number, got 2\.5"),
         (broken("features", num_centers=0), "num_centers must be at least 1, got 0"),
         (broken("features", num_centers=2.5), r"features\.num_centers must be a whole number, got 2\.5"),
@@ -450,7 +463,7 @@ def broken(*path, **values) -> dict:
         (broken("features", num_centers=[0]), r"num_centers must be whole numbers of at least 1, got \(0,\)"),
         (
             broken(features=3),
-            "features must be an object with the fields kind, num_centers, bandwidth, degree, got 3",
+            "features must be an object with the fields kind, num_centers, bandwidth, degree, .*, got 3",
         ),
         (broken(constraint="penalty"), "constraint must be one of sigmoid, clip, got 'penalty'"),
         (broken(kl_bound=0), "kl_bound must be above zero, got 0"),
@@ -543,7 +556,7 @@ def test_a_session_from_a_policy_begins_with_it(tmp_path):
     assert plain.settings.constraint == "clip"
     elsewhere = dataclasses.replace(policy, features=rbf_features(0.0, 3.0, 3))
     with pytest.raises(
-        UserError, match="a session must begin with linear or polynomial features, or with RBFs over"
+        UserError, match="must begin with linear or polynomial features, or with RBFs or kernel features over"
     ):
         RobotSession.create(tmp_path / "other", policy=elsewhere)
     for exploration in (0.0, -1.0, math.nan, math.inf):
@@ -677,6 +690,8 @@ def define_with_three_contexts(**features) -> dict:
         ({"kind": "polynomial"}, "polynomial", 2, 10),
         ({"num_centers": 2}, "rbf", None, 8),
         ({"kind": "rbf"}, "rbf", None, 8),
+        ({"kind": "kernel"}, "kernel", None, 21),
+        ({"num_points": 7, "bandwidth": 1.0}, "kernel", None, 8),
     ],
 )
 def test_three_contexts_have_polynomial_features_by_default(tmp_path, features, kind, degree, size):
@@ -704,9 +719,9 @@ def test_a_session_with_three_contexts_learns(tmp_path):
     assert np.mean(rewards[-40:]) > 0.5 * np.mean(rewards[:40])
 
 
-def test_settings_without_a_degree_have_the_digest_of_earlier_versions():
+def test_settings_without_degree_and_points_have_the_digest_of_earlier_versions():
     settings = plain.read(Settings, DEFINITION, "settings")
     values = dataclasses.asdict(settings)
-    del values["features"]["degree"]
+    del values["features"]["degree"], values["features"]["num_points"]
     expected = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
     assert settings.digest() == expected

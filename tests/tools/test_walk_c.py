@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from jax import lax
 
+from creps_jax.contexts import context_grid
 from creps_jax.errors import UserError
 from creps_jax.files import policies_folder
+from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import polynomial_features
 from creps_jax.policies.learned import load
 from creps_jax.policies.space import Space
@@ -67,6 +69,14 @@ def with_friction(policy):
     return dataclasses.replace(wider, policy=policy.policy._replace(coef=jnp.asarray(coef, jnp.float32)))
 
 
+def with_features(policy, features):
+    """Return a policy of other features whose mean is close to that of a policy."""
+    contexts = context_grid(policy.contexts.low, policy.contexts.high, 6)
+    means = policy.features(contexts) @ policy.policy.coef
+    coef = np.linalg.lstsq(np.asarray(features(contexts)), np.asarray(means), rcond=1e-4)[0]
+    return dataclasses.replace(policy, features=features, policy=policy.policy._replace(coef=coef))
+
+
 def assert_equal_walks(policy, robot, period, seconds, folder):
     """Compare C with Python over a walk whose commands and measurements change."""
     num = round(seconds / period)
@@ -97,6 +107,14 @@ def test_set_points_are_those_of_python(walk, period, tmp_path):
     if walk.endswith("with a condition"):
         policy = with_friction(policy)
     assert_equal_walks(policy, NAO_H25 if walk == "real NAO" else NAO, period, 20.0, tmp_path)
+
+
+@needs_compiler
+@pytest.mark.parametrize("features", [Features("rbf"), Features("kernel", num_points=8)])
+def test_set_points_of_other_features_are_those_of_python(features, tmp_path):
+    policy = policy_of(*WALKS["steered"])
+    other = with_features(policy, features.make(policy.contexts.low, policy.contexts.high))
+    assert_equal_walks(other, NAO, 0.02, 8.0, tmp_path)
 
 
 @needs_compiler

@@ -102,6 +102,18 @@ RBF = """\
     }
 """
 
+KERNEL = """\
+    features[0] = 1.0f;
+    for (i = 1; i < ${PREFIX}_NUM_FEATURES; ++i) {
+        float square = 0.0f;
+        for (j = 0; j < ${PREFIX}_NUM_CONTEXTS; ++j) {
+            const float distance = (nearest[j] - ${prefix}_centers[i - 1][j]) / ${prefix}_widths[j];
+            square += distance * distance;
+        }
+        features[i] = expf(-0.5f * square);
+    }
+"""
+
 _BOUNDS = """\
         const float low = ${prefix}_parameter_low[j], high = ${prefix}_parameter_high[j];
 """

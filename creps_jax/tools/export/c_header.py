@@ -10,7 +10,7 @@ import numpy as np
 
 from creps_jax.files import package_version, save_text
 from creps_jax.policies.learned import Learned
-from creps_jax.tools.export.c_code import HEADER, HOLD_BOUNDS, LINEAR, POLYNOMIAL, RBF
+from creps_jax.tools.export.c_code import HEADER, HOLD_BOUNDS, KERNEL, LINEAR, POLYNOMIAL, RBF
 from creps_jax.tools.export.formula import Formula, formula_of
 
 # Characters that need no escape in a C string: not quotes, backslashes, nor "?", as "??" starts a trigraph.
@@ -34,8 +34,8 @@ def make_header(policy: Learned, name: str | None = None) -> str:
     formula = formula_of(policy)
     prefix = _prefix(str(policy.task.get("name", "")) if name is None else name)
     names = {"prefix": prefix, "PREFIX": prefix.upper()}
-    is_linear = not len(formula.centers) and formula.exponents.max() == 1
-    features = RBF if len(formula.centers) else LINEAR if is_linear else POLYNOMIAL
+    is_linear = formula.kind == "polynomial" and formula.exponents.max() == 1
+    features = LINEAR if is_linear else {"polynomial": POLYNOMIAL, "rbf": RBF, "kernel": KERNEL}[formula.kind]
     is_bounded = policy.parameters.constraint != "none"
     held = f", within {prefix}_parameter_low to {prefix}_parameter_high" if is_bounded else ""
     middle = 0.5 * (formula.context_low + formula.context_high)
@@ -73,7 +73,8 @@ def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
         floats(f"{prefix}_coef[{features}][{params}]", formula.coef),
     ]
     if len(formula.centers):
-        tables.append(floats(f"{prefix}_centers[{features}][{contexts}]", formula.centers))
+        num = features if formula.kind == "rbf" else f"{features} - 1"
+        tables.append(floats(f"{prefix}_centers[{num}][{contexts}]", formula.centers))
         tables.append(floats(f"{prefix}_widths[{contexts}]", formula.widths))
     elif formula.exponents.max() > 1:
         rows = [f"{{{', '.join(map(str, row))}}}" for row in formula.exponents.tolist()]

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from creps_jax.errors import UserError
+from creps_jax.policies.feature_functions import Kernel, middle_and_half
 from creps_jax.policies.features import describe, rbf_grid
 from creps_jax.policies.learned import Learned
 
@@ -14,20 +15,23 @@ from creps_jax.policies.learned import Learned
 class Formula(NamedTuple):
     """The numbers of a policy, for s context variables, p features and d parameters.
 
-    All but the exponents are float32.
+    All but the kind and the exponents are float32.
 
     Attributes:
+        kind: "polynomial" (also for linear features), "rbf" or "kernel".
         context_low: (s,) lower ends of the learned range.
         context_high: (s,) upper ends of the learned range.
         exponents: (p, s) int32 exponent of each context variable in each linear or polynomial feature; (0, s)
-            for RBFs.
-        centers: (p, s) centres of the RBFs; (0, s) if the features are linear or polynomial.
-        widths: (s,) widths of the RBFs.
-        coef: (p, d) coefficients of the features.
+            for RBFs and kernels.
+        centers: (p, s) centres of the RBFs; (p - 1, s) inducing contexts of a kernel; (0, s) for others.
+        widths: (s,) widths of the RBFs or the kernel.
+        coef: (p, d) coefficients of the features; of a kernel, whose features are not whitened here, of the
+            constant and of the covariance with each inducing context.
         param_low: (d,) lower bounds of the parameters.
         param_high: (d,) upper bounds.
     """
 
+    kind: str
     context_low: np.ndarray
     context_high: np.ndarray
     exponents: np.ndarray
@@ -39,7 +43,7 @@ class Formula(NamedTuple):
 
 
 def formula_of(learned: Learned) -> Formula:
-    """Return the numbers of a policy, whose features must be linear, polynomial or RBFs.
+    """Return the numbers of a policy, whose features must be linear, polynomial, RBFs or a kernel.
 
     Raises:
         UserError: if its features cannot be exported, or a number is too large for single precision.
@@ -47,36 +51,48 @@ def formula_of(learned: Learned) -> Formula:
     num_contexts = learned.contexts.size
     exponents = np.zeros((0, num_contexts), np.int32)
     centers, widths = np.zeros((0, num_contexts)), np.ones(num_contexts)
+    coef = np.asarray(learned.policy.coef)
     features = describe(learned.features)
-    if features["kind"] == "rbf":
+    kind = features.pop("kind")
+    if kind == "rbf":
         centers, widths = rbf_grid(
             features["low"], features["high"], features["num_centers"], bandwidth=features["width"]
         )
-    elif features["kind"] in ("linear", "polynomial"):
-        exponents = _exponents(features)
+    elif kind == "kernel":
+        kernel = Kernel(**features)
+        middle, half = middle_and_half(kernel.low, kernel.high)
+        centers, widths = middle + kernel.from_middle() * half, np.asarray(kernel.bandwidth)
+        coef = np.concatenate([coef[:1], kernel.inverse_root() @ coef[1:]])
+    elif kind in ("linear", "polynomial"):
+        kind, exponents = "polynomial", _exponents(features)
     else:
-        raise UserError(f"features must be linear, polynomial or rbf to be exported, got {features['kind']}")
+        raise UserError(f"features must be linear, polynomial, rbf or kernel to be exported, got {kind}")
     if not np.isfinite([learned.contexts.low, learned.contexts.high]).all():
         raise UserError(f"contexts must have a range to be exported, got {learned.contexts}")
     numbers = Formula(
+        kind=kind,
         context_low=np.asarray(learned.contexts.low),
         context_high=np.asarray(learned.contexts.high),
         exponents=exponents,
         centers=centers,
         widths=widths,
-        coef=np.asarray(learned.policy.coef),
+        coef=coef,
         param_low=np.asarray(learned.parameters.low),
         param_high=np.asarray(learned.parameters.high),
     )
+    return _in_single_precision(numbers)
+
+
+def _in_single_precision(numbers: Formula) -> Formula:
+    arrays = {name: values for name, values in numbers._asdict().items() if name not in ("kind", "exponents")}
     with np.errstate(over="ignore"):
-        single = Formula(*(np.asarray(values, np.float32) for values in numbers))
-    single = single._replace(exponents=exponents)
-    for name, values in single._asdict().items():
+        single = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
+    for name, values in single.items():
         # Parameters without bounds have infinite bounds.
-        is_held = np.isfinite(values) | (np.isinf(getattr(numbers, name)) & name.startswith("param"))
+        is_held = np.isfinite(values) | (np.isinf(arrays[name]) & name.startswith("param"))
         if not is_held.all():
             raise UserError(f"{name} of the policy is too large for single precision")
-    return single
+    return numbers._replace(**single)
 
 
 def _exponents(features: Mapping[str, Any]) -> np.ndarray:

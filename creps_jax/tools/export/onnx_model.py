@@ -89,13 +89,23 @@ def _mean(kind: str) -> list[onnx.NodeProto]:
             _node("features", "ReduceProd", "powers", axes=[2], keepdims=0),
             _node("mean", "MatMul", "features", "coef"),
         ]
-    return [
+    log_weights = [
         _node("row", "Unsqueeze", "nearest", "middle_axis"),
         _node("offset", "Sub", "row", "centers"),
         _node("distance", "Div", "offset", "widths"),
         _node("squares", "Mul", "distance", "distance"),
         _node("square", "ReduceSum", "squares", "last_axis", keepdims=0),
         _node("log_weights", "Mul", "square", "minus_half"),
+    ]
+    if kind == "kernel":
+        return [
+            *log_weights,
+            _node("features", "Exp", "log_weights"),
+            _node("rise", "MatMul", "features", "slope"),
+            _node("mean", "Add", "rise", "intercept"),
+        ]
+    return [
+        *log_weights,
         _node("features", "Softmax", "log_weights", axis=1),
         _node("mean", "MatMul", "features", "coef"),
     ]
@@ -121,7 +131,8 @@ def _hold_bounds(constraint: str) -> list[onnx.NodeProto]:
 
 def _constants(formula: Formula) -> dict[str, np.ndarray]:
     """Return all constants that a node may use, by name."""
-    return formula._asdict() | {
+    numbers = {name: values for name, values in formula._asdict().items() if name != "kind"}
+    return numbers | {
         "intercept": formula.coef[0],
         "slope": formula.coef[1:],
         "minus_half": np.array(-0.5, np.float32),

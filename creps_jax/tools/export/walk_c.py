@@ -214,24 +214,24 @@ def _chain_constants(robot: Humanoid) -> list[str]:
 def _policy_constants(policy: Learned) -> list[str]:
     formula = formula_of(policy)
     num_features, num_contexts = len(formula.coef), len(formula.context_low)
-    is_rbf = len(formula.centers) > 0
     lines = [
         f"#define IS_STEERED {int(is_steered(policy))}",
         f"#define IS_SQUASHED {int(policy.parameters.constraint == SIGMOID)}",
         f"#define NUM_CONTEXTS {num_contexts}",
         f"#define NUM_PARAMETERS {formula.coef.shape[1]}",
         f"#define NUM_FEATURES {num_features}",
-        f"#define FEATURES_ARE_RBF {int(is_rbf)}",
+        f"#define FEATURES_ARE_RBF {int(formula.kind == 'rbf')}",
+        f"#define FEATURES_ARE_KERNEL {int(formula.kind == 'kernel')}",
         _vector("CONTEXT_LOW", formula.context_low),
         _vector("CONTEXT_HIGH", formula.context_high),
         _vector("PARAMETER_LOW", formula.param_low),
         _vector("PARAMETER_HIGH", formula.param_high),
         floats(f"COEF[{num_features}][{formula.coef.shape[1]}]", formula.coef),
     ]
-    if is_rbf:
+    if formula.kind != "polynomial":
         return [
             *lines,
-            floats(f"CENTERS[{num_features}][{num_contexts}]", formula.centers),
+            floats(f"CENTERS[{len(formula.centers)}][{num_contexts}]", formula.centers),
             _vector("WIDTHS", formula.widths),
         ]
     rows = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in formula.exponents)

@@ -152,9 +152,10 @@ class Settings:
     def digest(self) -> str:
         """Return a short text that differs from the text of other settings."""
         values = dataclasses.asdict(self)
-        # Sessions of earlier versions have no degree.
-        if self.features.degree is None:
-            del values["features"]["degree"]
+        # Sessions of earlier versions have no degree and no number of points.
+        for name in ("degree", "num_points"):
+            if values["features"][name] is None:
+                del values["features"][name]
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -62,10 +62,14 @@ def _settings_of_features(learned: Learned) -> Features:
         settings = Features("rbf", num_centers)
         if settings.make(low, high) != learned.features:
             settings = Features("rbf", num_centers, widths[0])
+    elif described["kind"] == "kernel":
+        settings = Features("kernel", num_points=described["num"])
+        if settings.make(low, high) != learned.features:
+            settings = dataclasses.replace(settings, bandwidth=described["bandwidth"][0])
     if settings.make(low, high) != learned.features:
         raise UserError(
-            "a session must begin with linear or polynomial features, or with RBFs over the range of "
-            f"the contexts that have the default width or one width, got {described}"
+            "a session must begin with linear or polynomial features, or with RBFs or kernel features over "
+            f"the range of the contexts that have the default width or one width, got {described}"
         )
     return settings
 
