@@ -15,8 +15,12 @@ from matplotlib.figure import Figure
 
 from creps_jax.contexts import context_grid
 from creps_jax.errors import UserError
-from creps_jax.policies.feature_functions import ScaledPolynomial
-from creps_jax.policies.features import FeatureMap, kernel_features, polynomial_features, rbf_features
+from creps_jax.policies.features import (
+    FeatureMap,
+    kernel_features,
+    rbf_features,
+    scaled_polynomial_features,
+)
 from creps_jax.policies.network import network_policy, start_network
 from creps_jax.tasks import Task, average_repeats, hole_reaching, sinus, via_point_reaching
 from creps_jax.tools import plots
@@ -136,11 +140,9 @@ def _features(
     bandwidth: float | None = None,
 ) -> dict[str, FeatureMap]:
     """Make RBFs, polynomials of the scaled context, and a Gaussian process, over one range."""
-    lows, highs = (tuple(map(float, np.atleast_1d(end))) for end in (low, high))
-    scaled = ScaledPolynomial(lows, highs, degree)
     return {
         "rbf": rbf_features(low, high, centers),
-        "polynomial": polynomial_features(len(lows), degree)._replace(apply=scaled),
+        "polynomial": scaled_polynomial_features(low, high, degree),
         "kernel": kernel_features(low, high, points, bandwidth=bandwidth),
     }
 

@@ -29,7 +29,7 @@ import creps_jax as cj
 from creps_jax import tasks
 from creps_jax.files import policies_folder
 from creps_jax.numerics import rotations
-from creps_jax.policies.features import kernel_features, polynomial_features
+from creps_jax.policies.features import kernel_features, polynomial_features, scaled_polynomial_features
 from creps_jax.policies.network import network_policy, start_network
 from creps_jax.robots import mjcf, nao_geometry, screw_kinematics, spec
 from creps_jax.robots.robot import NAO, NAO_H25
@@ -879,6 +879,13 @@ ROWS = {
         penalty=number(10.0, least=0.0),
     ),
     "polynomial_features": row(polynomial_features, use=use_features, dim=count(2), degree=count(3)),
+    "scaled_polynomial_features": row(
+        scaled_polynomial_features,
+        use=use_features,
+        low=vector((0.0, 0.0)),
+        high=vector((1.0, 2.0)),
+        degree=count(3),
+    ),
     "kernel_features": row(
         kernel_features,
         use=use_features,

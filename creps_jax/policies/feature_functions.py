@@ -165,7 +165,7 @@ class Kernel:
         context = _checked_context(context, len(self.low))
         middle, half = middle_and_half(self.low, self.high)
         ratio = half / np.asarray(self.bandwidth)
-        points, root = self.from_middle() * ratio, self.inverse_root()
+        points, root = _from_middle(half.size, self.num) * ratio, self.inverse_root()
         middle, half, ratio, points, root = (
             jnp.asarray(numbers, context.dtype) for numbers in (middle, half, ratio, points, root)
         )
@@ -174,9 +174,10 @@ class Kernel:
         covariance = jnp.exp(-0.5 * jnp.sum(distance**2, axis=1))
         return jnp.concatenate([jnp.ones_like(covariance[:1]), exact_dot(covariance, root)])
 
-    def from_middle(self) -> Float[np.ndarray, "n s"]:
-        """Return the inducing contexts, scaled from the range to -1 to 1."""
-        return 2.0 * inducing_contexts(len(self.low), self.num) - 1.0
+    def inducing(self) -> Float[np.ndarray, "n s"]:
+        """Return the inducing contexts."""
+        middle, half = middle_and_half(self.low, self.high)
+        return middle + half * _from_middle(half.size, self.num)
 
     def inverse_root(self) -> Float[np.ndarray, "n n"]:
         """Return the inverse root of the kernel matrix of the inducing contexts."""
@@ -195,6 +196,11 @@ def middle_and_half(
 def inducing_contexts(dim: int, num: int) -> np.ndarray:
     """Return the first points (num, dim) of the Halton sequence, which fill the cube from 0 to 1 evenly."""
     return np.stack([_radical_inverse(np.arange(1, num + 1), base) for base in _primes(dim)], axis=1)
+
+
+def _from_middle(dim: int, num: int) -> np.ndarray:
+    """Return the inducing contexts, scaled from the range to -1 to 1."""
+    return 2.0 * inducing_contexts(dim, num) - 1.0
 
 
 def _primes(num: int) -> list[int]:
@@ -220,7 +226,7 @@ def _radical_inverse(index: np.ndarray, base: int) -> np.ndarray:
 @functools.lru_cache(maxsize=8)
 def _inverse_root(num: int, scale: tuple[float, ...]) -> np.ndarray:
     """Return the inverse root of the kernel matrix of the inducing contexts, scaled to bandwidths of one."""
-    points = (2.0 * inducing_contexts(len(scale), num) - 1.0) * np.array(scale)
+    points = _from_middle(len(scale), num) * np.array(scale)
     covariance = np.exp(-0.5 * np.sum((points[:, None] - points[None]) ** 2, axis=2))
     values, axes = np.linalg.eigh(covariance + _JITTER * np.eye(num))
     return (axes / np.sqrt(np.maximum(values, _JITTER))) @ axes.T

@@ -1,7 +1,7 @@
 """Plain settings of features, for runs, sessions and files; jax starts when the features are made."""
 
 import dataclasses
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from creps_jax.policies.features import FeatureMap
     from creps_jax.typing import VectorLike
 
-__all__ = ["FEATURE_KINDS", "Features"]
+__all__ = ["FEATURE_KINDS", "Features", "of_earlier_versions"]
 
 FEATURE_KINDS = ("linear", "polynomial", "rbf", "kernel")
 """The kinds of features that `Features` can make."""
@@ -31,6 +31,8 @@ class Features:
             variables, and 2 for other numbers of them.
         num_points: Number of inducing contexts of kernel features, see `kernel_features`; None is 10 for one
             or two variables, 20 for three, and 30 for more.
+        scaled: Whether polynomial features are of the context scaled from its range to -1 to 1; not used by
+            other kinds.
     """
 
     kind: str | None = None
@@ -38,6 +40,7 @@ class Features:
     bandwidth: float | None = None
     degree: int | None = None
     num_points: int | None = None
+    scaled: bool = True
 
     def __post_init__(self) -> None:
         # Settings are hashed.
@@ -80,6 +83,8 @@ class Features:
         if kind == "linear":
             return features.linear_features(dim)
         if kind == "polynomial":
+            if self.scaled:
+                return features.scaled_polynomial_features(low, high, self._degree(dim))
             return features.polynomial_features(dim, self._degree(dim))
         if kind == "rbf":
             return features.rbf_features(low, high, self._centers(dim), bandwidth=self.bandwidth)
@@ -117,3 +122,14 @@ class Features:
 
     def _points(self, dim: int) -> int:
         return {1: 10, 2: 10, 3: 20}.get(dim, 30) if self.num_points is None else self.num_points
+
+
+def of_earlier_versions(settings: Any) -> Any:
+    """Return plain settings from a file that a program has written, as the current version states them.
+
+    Earlier versions did not scale the contexts of polynomial features, and did not write `scaled`.
+    """
+    features = settings.get("features") if isinstance(settings, dict) else None
+    if not isinstance(features, dict):
+        return settings
+    return {**settings, "features": {"scaled": False, **features}}

@@ -17,6 +17,7 @@ from creps_jax.policies.feature_functions import (
     Polynomial,
     Quadratic,
     Radial,
+    ScaledPolynomial,
     grid_of_centers,
     middle_and_half,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "quadratic_features",
     "rbf_features",
     "rbf_grid",
+    "scaled_polynomial_features",
 ]
 
 _MOST_FEATURES = 1_000_000
@@ -138,13 +140,41 @@ def polynomial_features(dim: int, degree: int) -> FeatureMap:
         ValueError: If `dim` or `degree` is below 1, or there are too many features; on `apply`, if a context
             has another shape than (dim,).
     """
+    return _monomials(Polynomial(dim, degree), dim, degree)
+
+
+@checks.arguments
+def scaled_polynomial_features(low: VectorLike, high: VectorLike, degree: int) -> FeatureMap:
+    """Make `polynomial_features` of the context, scaled from a range to -1 to 1.
+
+    Within the range no monomial exceeds 1, whatever the unit and the zero of the context.
+
+    Args:
+        low: Lower end of the range of each context variable.
+        high: Upper end of the range of each context variable.
+        degree: The largest sum of the exponents in a monomial.
+
+    Returns:
+        The map to (dim + degree)! / (dim! degree!) features, for dim context variables.
+
+    Raises:
+        ValueError: If the ends differ in length, a number is not finite, low >= high, `degree` is below 1, or
+            there are too many features; on `apply`, if a context has another shape than (dim,).
+    """
+    lows, highs = checks.ends(low, high)
+    return _monomials(
+        ScaledPolynomial(tuple(lows.tolist()), tuple(highs.tolist()), degree), lows.size, degree
+    )
+
+
+def _monomials(apply: Polynomial | ScaledPolynomial, dim: int, degree: int) -> FeatureMap:
     # A number with hundreds of digits or more is not computed.
     size = math.inf if min(dim, degree) > 100 else math.comb(dim + degree, degree)
     if size > _MOST_FEATURES:
         raise ValueError(
             f"dim and degree must leave at most {_MOST_FEATURES} features, got {dim} and {degree}"
         )
-    return FeatureMap(Polynomial(dim, degree), int(size), dim, constant=(1.0,) + (0.0,) * (int(size) - 1))
+    return FeatureMap(apply, int(size), dim, constant=(1.0,) + (0.0,) * (int(size) - 1))
 
 
 def rbf_features(
@@ -306,6 +336,7 @@ _KINDS = {
     "linear": Linear,
     "quadratic": Quadratic,
     "polynomial": Polynomial,
+    "scaled polynomial": ScaledPolynomial,
     "rbf": Radial,
     "kernel": Kernel,
 }
@@ -314,6 +345,7 @@ _MAKERS = {
     "linear": linear_features,
     "quadratic": quadratic_features,
     "polynomial": polynomial_features,
+    "scaled polynomial": scaled_polynomial_features,
     "kernel": kernel_features,
 }
 """Makers of the kinds whose settings are the fields of their functions."""

@@ -17,8 +17,7 @@ from creps_jax.keys import threefry
 from creps_jax.numerics.linalg import divided
 from creps_jax.policies import gaussian
 from creps_jax.policies.base import Policy
-from creps_jax.policies.feature_functions import ScaledPolynomial
-from creps_jax.policies.features import FeatureMap, polynomial_features
+from creps_jax.policies.features import FeatureMap, scaled_polynomial_features
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.policies.network_fit import NetworkFit, units
 from creps_jax.typing import Array, Float, PRNGKey, Scalar, VectorLike
@@ -90,16 +89,14 @@ def network_policy(
         ValueError: If low and high are not vectors of one length with low < high, or a setting is not above
             zero.
     """
-    lows, highs = checks.ends(low, high)
     bounds = {"mean_kl_bound": mean_kl_bound, "cov_kl_bound": cov_kl_bound}
     if entropy_loss_bound is not None:
         bounds["entropy_loss_bound"] = entropy_loss_bound
     for name, value in {"learning_rate": learning_rate, **bounds}.items():
         checks.number(name, value, above=0.0)
-    scaled = ScaledPolynomial(tuple(lows.tolist()), tuple(highs.tolist()), _BASELINE_DEGREE)
     fit = NetworkFit(steps, learning_rate, mean_kl_bound, cov_kl_bound, entropy_loss_bound)
     return Policy(
-        polynomial_features(lows.size, _BASELINE_DEGREE)._replace(apply=scaled),
+        scaled_polynomial_features(low, high, _BASELINE_DEGREE),
         mean=_mean,
         sample=_sample,
         log_prob=_log_prob,

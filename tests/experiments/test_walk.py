@@ -35,7 +35,7 @@ from creps_jax.walking.params import (
     PARAM_NAMES,
 )
 from creps_jax.walking.posture import Balance
-from experiments import claims, fig11_walk, request, runner, walk, walk_slope
+from experiments import claims, fig11_walk, registry, request, runner, walk, walk_slope
 from experiments.cli import main
 from experiments.walking import learning as walk_learning
 from experiments.walking.settings import BOUNDS, PHYSICS, SAMPLERS
@@ -267,6 +267,13 @@ def test_settings_within_settings_are_options(bench):
     assert main(["run", "walk", *options, "--out", "seven"]) == 0
     kept = results.load_manifest(Path("seven"))["settings"]
     assert (kept["features"]["num_centers"], kept["kl_bound"]) == (7, 1.0)
+
+
+def test_polynomials_of_a_run_of_an_earlier_version_are_not_scaled():
+    given = dataclasses.asdict(walk.Settings(features=Features("polynomial")))
+    del given["features"]["scaled"]
+    settings = request.settings_of(registry.load("walk"), Path("run"), {"settings": given})
+    assert settings.features == Features("polynomial", scaled=False)
 
 
 @pytest.mark.parametrize("num_centers", [None, 4, (4, 3)])

@@ -1,6 +1,7 @@
 """Feature maps are what they say, sum to one where they should, and stay finite anywhere."""
 
 import copy
+import dataclasses
 import itertools
 import json
 import math
@@ -13,8 +14,9 @@ import numpy as np
 import pytest
 from scipy.stats import qmc
 
+import creps_jax as cj
 from creps_jax.policies.feature_functions import inducing_contexts
-from creps_jax.policies.feature_settings import Features
+from creps_jax.policies.feature_settings import Features, of_earlier_versions
 from creps_jax.policies.features import (
     describe,
     from_description,
@@ -24,12 +26,14 @@ from creps_jax.policies.features import (
     quadratic_features,
     rbf_features,
     rbf_grid,
+    scaled_polynomial_features,
 )
 
 MAPS = {
     "linear": linear_features(2),
     "quadratic": quadratic_features(2),
     "polynomial": polynomial_features(2, 3),
+    "scaled polynomial": scaled_polynomial_features((0.0, -1.0), (1.0, 3.0), 3),
     "radial": rbf_features((0.0, -1.0), (1.0, 3.0), 3),
     "kernel": kernel_features((0.0, -1.0), (1.0, 3.0), 12),
 }
@@ -77,6 +81,20 @@ def test_polynomial_features_are_all_monomials(dim, degree):
     np.testing.assert_allclose(features.apply(jnp.float32(context)), expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("low", "high"), [((0.0, 990.0), (1000.0, 1000.0)), ((-1e-3, 1.0), (1e-3, 2.0))])
+def test_scaled_polynomials_are_of_the_range_from_minus_one_to_one(low, high):
+    features = scaled_polynomial_features(low, high, 3)
+    shares = cj.context_grid((-1.0, -1.0), (1.0, 1.0), 5)
+    middle, half = 0.5 * np.add(high, low), 0.5 * np.subtract(high, low)
+    rows = features(jnp.asarray(middle + half * np.asarray(shares), jnp.float32))
+    np.testing.assert_allclose(rows, polynomial_features(2, 3)(shares), atol=2e-4)
+    assert np.abs(rows).max() <= 1.0 and features.constant == polynomial_features(2, 3).constant
+    settings = Features("polynomial", degree=3)
+    assert settings.make(low, high) == features
+    unscaled = Features("polynomial", degree=3, scaled=False)
+    assert unscaled.make(low, high) == polynomial_features(2, 3)
+
+
 def test_polynomial_features_by_hand():
     x, y, z = 2.0, -3.0, 5.0
     row = polynomial_features(3, 2).apply(jnp.array([x, y, z]))
@@ -97,6 +115,8 @@ MAKERS = {
     "quadratic": lambda: quadratic_features(2),
     "polynomial": lambda: polynomial_features(2, 2),
     "polynomial of another degree": lambda: polynomial_features(2, 3),
+    "scaled polynomial": lambda: scaled_polynomial_features((0.0, 0.0), (1.0, 1.0), 2),
+    "scaled polynomial of another range": lambda: scaled_polynomial_features((0.0, 0.0), (1.0, 2.0), 2),
     "radial": lambda: rbf_features((0.0, -1.0), (1.0, 3.0), 3),
     "radial of NumPy": lambda: rbf_features(np.array([0.0, -2.0]), jnp.array([1.0, 3.0]), 3),
     "kernel": lambda: kernel_features((0.0, -1.0), (1.0, 3.0), 9),
@@ -412,6 +432,13 @@ def test_settings_make_kernel_features(dim, num):
     wide = kernel_features(low, high, 4, bandwidth=5.0)
     assert Features(num_points=4, bandwidth=5.0).make(low, high) == wide
     assert Features(num_points=4).make_baseline(low, high) == kernel_features(low, high, 4)
+
+
+def test_plain_settings_of_earlier_versions_have_polynomials_that_are_not_scaled():
+    before = {"features": {"kind": "polynomial", "degree": 2}, "seed": 3}
+    assert of_earlier_versions(before) == {"features": {**before["features"], "scaled": False}, "seed": 3}
+    for now in ({"features": dataclasses.asdict(Features())}, {"seed": 3}, {"features": 3}, [1], None):
+        assert of_earlier_versions(now) == now
 
 
 @pytest.mark.parametrize("num", [0, -1, 2001])

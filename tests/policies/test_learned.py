@@ -18,6 +18,7 @@ from creps_jax.policies.features import (
     polynomial_features,
     quadratic_features,
     rbf_features,
+    scaled_polynomial_features,
 )
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned, load, save
@@ -50,6 +51,7 @@ FEATURES = {
     "quadratic": (quadratic_features(1), SPEED),
     "polynomial": (polynomial_features(2, 3), Space(("speed", "slope"), (0.1, -5.0), (0.6, 5.0))),
     "rbf per axis": (rbf_features([0, 0], [1, 1], (2, 3)), Space(("x", "y"), (0.0, 0.0), (1.0, 1.0))),
+    "scaled polynomial": (scaled_polynomial_features(0.0, 1.0, 3), SPEED),
     "kernel": (kernel_features(0.1, 0.6, 5), SPEED),
     "kernel per axis": (
         kernel_features([0, 0], [1, 1], 6, bandwidth=(0.3, 2.0)),

@@ -69,6 +69,7 @@ POLICIES = {
         make_policy("straight", Features("linear"), "sigmoid"),
         make_policy("clipped", Features("linear"), "clip"),
         make_policy("curved", Features("polynomial", degree=3), "sigmoid"),
+        make_policy("bent", Features("polynomial", degree=2, scaled=False), "sigmoid"),
         make_policy("smooth", Features("kernel", num_points=8), "sigmoid"),
         make_policy("point", Features("kernel", num_points=1), "clip"),
         make_policy("near", Features("kernel", num_points=12, bandwidth=0.05), "clip", num_contexts=1),

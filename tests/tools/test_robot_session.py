@@ -21,7 +21,7 @@ import pytest
 
 from creps_jax import files
 from creps_jax.errors import UserError
-from creps_jax.policies.features import rbf_features
+from creps_jax.policies.features import polynomial_features, rbf_features, scaled_polynomial_features
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned, load
 from creps_jax.policies.space import Space
@@ -556,7 +556,8 @@ def test_a_session_from_a_policy_begins_with_it(tmp_path):
     assert plain.settings.constraint == "clip"
     elsewhere = dataclasses.replace(policy, features=rbf_features(0.0, 3.0, 3))
     with pytest.raises(
-        UserError, match="must begin with linear or polynomial features, or with RBFs or kernel features over"
+        UserError,
+        match="must begin with linear or polynomial features, or with scaled polynomials, RBFs",
     ):
         RobotSession.create(tmp_path / "other", policy=elsewhere)
     for exploration in (0.0, -1.0, math.nan, math.inf):
@@ -706,6 +707,26 @@ def test_three_contexts_have_polynomial_features_by_default(tmp_path, features, 
     assert again.policy().features == policy.features
 
 
+@pytest.mark.parametrize("is_before", [True, False])
+def test_polynomials_of_sessions_are_scaled_unless_an_earlier_version_began_them(tmp_path, is_before):
+    contexts = [{"name": f"c{i}", "low": 100.0, "high": 300.0} for i in range(3)]
+    define = define_with_three_contexts(scaled=not is_before) | {"contexts": contexts}
+    session = RobotSession.create(tmp_path / "arm", define=define)
+    session.ask()
+    path = tmp_path / "arm" / "settings.json"
+    settings = json.loads(path.read_text())
+    if is_before:
+        for name in ("num_points", "scaled"):
+            del settings["features"][name]
+    path.write_text(json.dumps(settings))
+    policy = RobotSession.open(tmp_path / "arm").policy()
+    ends = (100.0,) * 3, (300.0,) * 3
+    expected = polynomial_features(3, 2) if is_before else scaled_polynomial_features(*ends, 2)
+    assert policy.features == expected
+    again = RobotSession.create(tmp_path / "again", policy=policy)
+    assert again.policy().features == expected
+
+
 def test_a_session_with_three_contexts_learns(tmp_path):
     session = RobotSession.create(tmp_path / "arm", define=define_with_three_contexts())
     rewards = []
@@ -719,9 +740,10 @@ def test_a_session_with_three_contexts_learns(tmp_path):
     assert np.mean(rewards[-40:]) > 0.5 * np.mean(rewards[:40])
 
 
-def test_settings_without_degree_and_points_have_the_digest_of_earlier_versions():
+def test_settings_without_newer_fields_have_the_digest_of_earlier_versions():
     settings = plain.read(Settings, DEFINITION, "settings")
     values = dataclasses.asdict(settings)
-    del values["features"]["degree"], values["features"]["num_points"]
+    for name in ("degree", "num_points", "scaled"):
+        del values["features"][name]
     expected = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
     assert settings.digest() == expected

@@ -110,7 +110,9 @@ def test_set_points_are_those_of_python(walk, period, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("features", [Features("rbf"), Features("kernel", num_points=8)])
+@pytest.mark.parametrize(
+    "features", [Features("rbf"), Features("polynomial"), Features("kernel", num_points=8)]
+)
 def test_set_points_of_other_features_are_those_of_python(features, tmp_path):
     policy = policy_of(*WALKS["steered"])
     other = with_features(policy, features.make(policy.contexts.low, policy.contexts.high))

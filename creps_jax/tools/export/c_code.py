@@ -69,12 +69,16 @@ LINEAR = """\
 """
 
 POLYNOMIAL = """\
+    float scaled[${PREFIX}_NUM_CONTEXTS];
+    for (j = 0; j < ${PREFIX}_NUM_CONTEXTS; ++j) {
+        scaled[j] = (nearest[j] - ${prefix}_middle[j]) / ${prefix}_half[j];
+    }
     for (i = 0; i < ${PREFIX}_NUM_FEATURES; ++i) {
         features[i] = 1.0f;
         for (j = 0; j < ${PREFIX}_NUM_CONTEXTS; ++j) {
             int k;
             for (k = 0; k < ${prefix}_exponents[i][j]; ++k) {
-                features[i] *= nearest[j];
+                features[i] *= scaled[j];
             }
         }
     }

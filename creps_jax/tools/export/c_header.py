@@ -34,8 +34,7 @@ def make_header(policy: Learned, name: str | None = None) -> str:
     formula = formula_of(policy)
     prefix = _prefix(str(policy.task.get("name", "")) if name is None else name)
     names = {"prefix": prefix, "PREFIX": prefix.upper()}
-    is_linear = formula.kind == "polynomial" and formula.exponents.max() == 1
-    features = LINEAR if is_linear else {"polynomial": POLYNOMIAL, "rbf": RBF, "kernel": KERNEL}[formula.kind]
+    features = {"linear": LINEAR, "polynomial": POLYNOMIAL, "rbf": RBF, "kernel": KERNEL}[formula.kind]
     is_bounded = policy.parameters.constraint != "none"
     held = f", within {prefix}_parameter_low to {prefix}_parameter_high" if is_bounded else ""
     middle = 0.5 * (formula.context_low + formula.context_high)
@@ -76,7 +75,9 @@ def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
         num = features if formula.kind == "rbf" else f"{features} - 1"
         tables.append(floats(f"{prefix}_centers[{num}][{contexts}]", formula.centers))
         tables.append(floats(f"{prefix}_widths[{contexts}]", formula.widths))
-    elif formula.exponents.max() > 1:
+    elif formula.kind == "polynomial":
+        tables.append(floats(f"{prefix}_middle[{contexts}]", formula.middle))
+        tables.append(floats(f"{prefix}_half[{contexts}]", formula.half))
         rows = [f"{{{', '.join(map(str, row))}}}" for row in formula.exponents.tolist()]
         tables.append(f"static const int {prefix}_exponents[{features}][{contexts}] = {{{_lines(rows)}}};\n")
     return "\n".join(tables)

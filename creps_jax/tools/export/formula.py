@@ -1,8 +1,7 @@
 """The numbers with which a policy computes parameters from a context, in single precision."""
 
 import itertools
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,11 +17,13 @@ class Formula(NamedTuple):
     All but the kind and the exponents are float32.
 
     Attributes:
-        kind: "polynomial" (also for linear features), "rbf" or "kernel".
+        kind: "linear", "polynomial", "rbf" or "kernel".
         context_low: (s,) lower ends of the learned range.
         context_high: (s,) upper ends of the learned range.
-        exponents: (p, s) int32 exponent of each context variable in each linear or polynomial feature; (0, s)
-            for RBFs and kernels.
+        middle: (s,) subtracted from the context before its powers are taken; 0 for RBFs and kernels.
+        half: (s,) by which the difference is divided; 1 for RBFs and kernels.
+        exponents: (p, s) int32 exponent of each scaled context variable in each linear or polynomial feature;
+            (0, s) for RBFs and kernels.
         centers: (p, s) centres of the RBFs; (p - 1, s) inducing contexts of a kernel; (0, s) for others.
         widths: (s,) widths of the RBFs or the kernel.
         coef: (p, d) coefficients of the features; of a kernel, whose features are not whitened here, of the
@@ -34,6 +35,8 @@ class Formula(NamedTuple):
     kind: str
     context_low: np.ndarray
     context_high: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
     exponents: np.ndarray
     centers: np.ndarray
     widths: np.ndarray
@@ -49,6 +52,7 @@ def formula_of(learned: Learned) -> Formula:
         UserError: if its features cannot be exported, or a number is too large for single precision.
     """
     num_contexts = learned.contexts.size
+    middle, half = np.zeros(num_contexts), np.ones(num_contexts)
     exponents = np.zeros((0, num_contexts), np.int32)
     centers, widths = np.zeros((0, num_contexts)), np.ones(num_contexts)
     coef = np.asarray(learned.policy.coef)
@@ -60,11 +64,13 @@ def formula_of(learned: Learned) -> Formula:
         )
     elif kind == "kernel":
         kernel = Kernel(**features)
-        middle, half = middle_and_half(kernel.low, kernel.high)
-        centers, widths = middle + kernel.from_middle() * half, np.asarray(kernel.bandwidth)
+        centers, widths = kernel.inducing(), np.asarray(kernel.bandwidth)
         coef = np.concatenate([coef[:1], kernel.inverse_root() @ coef[1:]])
-    elif kind in ("linear", "polynomial"):
-        kind, exponents = "polynomial", _exponents(features)
+    elif kind in ("linear", "polynomial", "scaled polynomial"):
+        if kind == "scaled polynomial":
+            middle, half = middle_and_half(features["low"], features["high"])
+            kind = "polynomial"
+        exponents = _exponents(num_contexts, features.get("degree", 1))
     else:
         raise UserError(f"features must be linear, polynomial, rbf or kernel to be exported, got {kind}")
     if not np.isfinite([learned.contexts.low, learned.contexts.high]).all():
@@ -73,6 +79,8 @@ def formula_of(learned: Learned) -> Formula:
         kind=kind,
         context_low=np.asarray(learned.contexts.low),
         context_high=np.asarray(learned.contexts.high),
+        middle=middle,
+        half=half,
         exponents=exponents,
         centers=centers,
         widths=widths,
@@ -95,9 +103,8 @@ def _in_single_precision(numbers: Formula) -> Formula:
     return numbers._replace(**single)
 
 
-def _exponents(features: Mapping[str, Any]) -> np.ndarray:
+def _exponents(dim: int, degree: int) -> np.ndarray:
     """Return the exponent of each context variable in each of the linear or polynomial features."""
-    dim, degree = features["dim"], features.get("degree", 1)
     rows = []
     for each in range(degree + 1):
         for variables in itertools.combinations_with_replacement(range(dim), each):

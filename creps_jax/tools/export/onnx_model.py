@@ -9,7 +9,6 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from creps_jax.files import package_version, write_atomically
-from creps_jax.policies.features import describe
 from creps_jax.policies.learned import Learned
 from creps_jax.tools.export.formula import Formula, formula_of
 
@@ -34,9 +33,8 @@ def make_model(policy: Learned) -> onnx.ModelProto:
     Raises:
         UserError: if a number of the policy is too large for single precision.
     """
-    kind = describe(policy.features)["kind"]
     formula = formula_of(policy)
-    nodes = [*_clamp(), *_mean(kind), *_hold_bounds(policy.parameters.constraint)]
+    nodes = [*_clamp(), *_mean(formula.kind), *_hold_bounds(policy.parameters.constraint)]
     used = {name for node in nodes for name in node.input}
     constants = _constants(formula)
     tensors = [numpy_helper.from_array(values, name) for name, values in constants.items() if name in used]
@@ -84,7 +82,9 @@ def _mean(kind: str) -> list[onnx.NodeProto]:
         ]
     if kind == "polynomial":
         return [
-            _node("row", "Unsqueeze", "nearest", "middle_axis"),
+            _node("from_middle", "Sub", "nearest", "middle"),
+            _node("scaled", "Div", "from_middle", "half"),
+            _node("row", "Unsqueeze", "scaled", "middle_axis"),
             _node("powers", "Pow", "row", "exponents"),
             _node("features", "ReduceProd", "powers", axes=[2], keepdims=0),
             _node("mean", "MatMul", "features", "coef"),

@@ -228,14 +228,15 @@ def _policy_constants(policy: Learned) -> list[str]:
         _vector("PARAMETER_HIGH", formula.param_high),
         floats(f"COEF[{num_features}][{formula.coef.shape[1]}]", formula.coef),
     ]
-    if formula.kind != "polynomial":
+    if formula.kind in ("rbf", "kernel"):
         return [
             *lines,
             floats(f"CENTERS[{len(formula.centers)}][{num_contexts}]", formula.centers),
             _vector("WIDTHS", formula.widths),
         ]
     rows = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in formula.exponents)
-    return [*lines, f"static const int EXPONENTS[{num_features}][{num_contexts}] = {{{rows}}};"]
+    ends = [_vector("CONTEXT_MIDDLE", formula.middle), _vector("CONTEXT_HALF", formula.half)]
+    return [*lines, *ends, f"static const int EXPONENTS[{num_features}][{num_contexts}] = {{{rows}}};"]
 
 
 def _defined(numbers: Mapping[str, ScalarLike], counts: Mapping[str, int] | None = None) -> list[str]:

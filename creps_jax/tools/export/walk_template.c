@@ -497,12 +497,16 @@ static void compute_features(const float context[NUM_CONTEXTS], float features[N
         features[i] = expf(-0.5f * square);
     }
 #else
+    float scaled[NUM_CONTEXTS];
     int k;
+    for (j = 0; j < NUM_CONTEXTS; ++j) {
+        scaled[j] = (context[j] - CONTEXT_MIDDLE[j]) / CONTEXT_HALF[j];
+    }
     for (i = 0; i < NUM_FEATURES; ++i) {
         features[i] = 1.0f;
         for (j = 0; j < NUM_CONTEXTS; ++j) {
             for (k = 0; k < EXPONENTS[i][j]; ++k) {
-                features[i] *= context[j];
+                features[i] *= scaled[j];
             }
         }
     }

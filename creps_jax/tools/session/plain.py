@@ -115,6 +115,7 @@ _SIMPLE: dict[Any, tuple[str, Callable[[Any], bool]]] = {
     float: ("a finite number", is_number),
     int: ("a whole number", lambda value: isinstance(value, int) and is_number(value)),
     str: ("text", lambda value: isinstance(value, str)),
+    bool: ("true or false", lambda value: isinstance(value, bool)),
 }
 
 

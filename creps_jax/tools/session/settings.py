@@ -152,10 +152,12 @@ class Settings:
     def digest(self) -> str:
         """Return a short text that differs from the text of other settings."""
         values = dataclasses.asdict(self)
-        # Sessions of earlier versions have no degree and no number of points.
+        # Sessions of earlier versions do not have these fields, and polynomials that are not scaled.
         for name in ("degree", "num_points"):
             if values["features"][name] is None:
                 del values["features"][name]
+        if not (self.features.kind == "polynomial" and self.features.scaled):
+            del values["features"]["scaled"]
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

@@ -54,8 +54,9 @@ def _settings_of_features(learned: Learned) -> Features:
     low, high = learned.contexts.low, learned.contexts.high
     described = describe(learned.features)
     settings = Features("linear")
-    if described["kind"] == "polynomial":
-        settings = Features("polynomial", degree=described["degree"])
+    if described["kind"] in ("polynomial", "scaled polynomial"):
+        is_scaled = described["kind"] == "scaled polynomial"
+        settings = Features("polynomial", degree=described["degree"], scaled=is_scaled)
     elif described["kind"] == "rbf":
         counts, widths = described["num_centers"], described["width"]
         num_centers = counts[0] if len(set(counts)) == 1 else tuple(counts)
@@ -68,8 +69,8 @@ def _settings_of_features(learned: Learned) -> Features:
             settings = dataclasses.replace(settings, bandwidth=described["bandwidth"][0])
     if settings.make(low, high) != learned.features:
         raise UserError(
-            "a session must begin with linear or polynomial features, or with RBFs or kernel features over "
-            f"the range of the contexts that have the default width or one width, got {described}"
+            "a session must begin with linear or polynomial features, or with scaled polynomials, RBFs or a "
+            f"kernel over the range of the contexts, of the default width or one width, got {described}"
         )
     return settings
 

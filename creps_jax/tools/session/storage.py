@@ -9,9 +9,10 @@ from pathlib import Path
 
 from creps_jax import files
 from creps_jax.errors import UserError
+from creps_jax.policies.feature_settings import of_earlier_versions
 from creps_jax.tools import folder_lock
 from creps_jax.tools.session import plain
-from creps_jax.tools.session.settings import Settings, load_settings
+from creps_jax.tools.session.settings import Settings
 from creps_jax.tools.session.trials import FORMAT, Record
 
 SETTINGS = "settings.json"
@@ -52,7 +53,8 @@ def open_settings(folder: Path) -> Settings:
     """
     if not (folder / SETTINGS).exists():
         raise UserError(f"{folder} holds no robot session: it has no {SETTINGS} (session new makes one)")
-    return load_settings(folder / SETTINGS)
+    values = of_earlier_versions(files.load_json(folder / SETTINGS))
+    return plain.read(Settings, values, folder / SETTINGS)
 
 
 def load_record(folder: Path, settings: Settings) -> Record:
