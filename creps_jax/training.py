@@ -265,7 +265,7 @@ def learned(
 
     Raises:
         ValueError: If the task does not state its contexts and parameters, or the policy is of another kind
-            than `LinearGaussian`.
+            than `LinearGaussian` or `NetworkGaussian`.
     """
     if task.contexts is None or task.parameters is None:
         missing = "contexts" if task.contexts is None else "parameters"

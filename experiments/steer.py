@@ -18,7 +18,7 @@ from creps_jax.errors import UserError
 from creps_jax.policies.bounds import SIGMOID
 from creps_jax.policies.features import FeatureMap, polynomial_features
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
-from creps_jax.policies.learned import Learned
+from creps_jax.policies.learned import Learned, linear_policy
 from creps_jax.policies.space import Space
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import Creps, creps
@@ -198,7 +198,7 @@ def first_policy(settings: Settings) -> LinearGaussian:
         learned = load_walking_policy(Path(settings.start_policy), can_steer=True)
         if (learned.features, learned.parameters) != (settings.features(), PARAMETERS):
             raise UserError(f"{settings.start_policy} must have the features and bounds of these settings")
-        return learned.policy
+        return linear_policy(learned, "be learned further")
     low, high = np.array(NAO_STEERED_BOUNDS)
     duration = 0.5 * (low + high)[STEERED_PARAM_NAMES.index("step_duration")]
     start = start_policy(settings.features(), len(low), std=settings.start_std)

@@ -352,6 +352,8 @@ RUN = {
 SPACES = cj.Space("x", 0.0, 1.0), cj.Space(("a", "b"), (0.0, 0.0), (1.0, 1.0))
 SPEED = cj.Space(("speed",), (0.0,), (1.0,), ("m/s",))
 LEARNED = cj.Learned(POLICY, FEATURES, SPEED, SPACES[1])
+KIND = network_policy(0.0, 1.0)
+NETWORK = cj.Learned(start_network(KEY, KIND.features, D, hidden=3), KIND.features, SPEED, SPACES[1])
 STRAIGHT = cj.load(policies_folder() / "walk.npz")
 WALKER = cj.learned_walker(STRAIGHT)
 FOLDER = Path(tempfile.mkdtemp())
@@ -791,6 +793,21 @@ ROWS = {
         features=record(FEATURES),
         m_step=function(weighted_ml),
         ridge=number(0.1, least=0.0),
+    ),
+    "learned network": row(
+        cj.Learned,
+        use=lambda made: made.policy,
+        policy=record(NETWORK.policy),
+        features=features(NETWORK.features),
+        contexts=record(SPEED),
+        parameters=record(SPACES[1]),
+        task=Argument({}, one_of((5, "5"), ("walk", "walk"))),
+    ),
+    "save a network": row(
+        cj.save,
+        use=lambda _: 0,
+        path=Argument(FOLDER / "network.npz", NO_PATH),
+        learned=record(NETWORK),
     ),
     "learned": row(
         cj.learned,

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -14,19 +15,23 @@ from creps_jax import checks
 from creps_jax.errors import UserError
 from creps_jax.files import load_arrays, save_arrays
 from creps_jax.policies import features as feature_maps
-from creps_jax.policies import gaussian
+from creps_jax.policies import gaussian, network_mean
 from creps_jax.policies.bounds import CLIP, PENALTY
+from creps_jax.policies.feature_functions import ScaledPolynomial
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import FeatureMap
 from creps_jax.policies.gaussian import LinearGaussian
+from creps_jax.policies.network_mean import Layer, NetworkGaussian
 from creps_jax.policies.space import Space
 from creps_jax.typing import Array, Float
 
-__all__ = ["Learned", "load", "save"]
+__all__ = ["Learned", "linear_policy", "load", "save"]
 
 FORMAT = "creps_jax policy"
 VERSION = 3
-_READABLE = ("2", "3")
+_NETWORK_VERSION = 4
+"""The version of files with a network, which earlier versions of this package refuse to read."""
+_READABLE = ("2", "3", "4")
 _CLIP_BEFORE = PENALTY
 """The name of the constraint `clip` in files of version 2."""
 
@@ -38,8 +43,9 @@ class Learned:
     `learned(0.3)` returns the parameters for the context 0.3, by name, in their units.
 
     Attributes:
-        policy: The distribution of free parameters, before bounds are applied.
-        features: The features of the context.
+        policy: The distribution of free parameters, before bounds are applied: linear in the features, or a
+            network, see `network_policy`.
+        features: The features of the context; for a network, those of its `network_policy`.
         contexts: The context variables, with the ranges that the policy was learned for.
         parameters: The parameters, with their bounds and how they are kept within them.
         task: The name of the task that it was learned for, and the settings that it was learned with.
@@ -48,7 +54,7 @@ class Learned:
         ValueError: If the fields do not fit each other, or a number of the policy is not finite.
     """
 
-    policy: LinearGaussian
+    policy: LinearGaussian | NetworkGaussian
     features: FeatureMap
     contexts: Space
     parameters: Space
@@ -56,15 +62,15 @@ class Learned:
 
     def __post_init__(self) -> None:
         """Check that the fields fit each other."""
-        for name, kind in (
-            ("policy", LinearGaussian),
+        for name, *kinds in (
+            ("policy", LinearGaussian, NetworkGaussian),
             ("features", FeatureMap),
             ("contexts", Space),
             ("parameters", Space),
             ("task", Mapping),
         ):
-            checks.instance(name, getattr(self, name), kind)
-        policy = gaussian.checked("policy", self.policy, self.features)
+            checks.instance(name, getattr(self, name), *kinds)
+        policy = _checked_policy(self.policy, self.features)
         if policy.coef.shape[1] != self.parameters.size:
             raise ValueError(
                 f"policy must have a column of coef for each of {', '.join(self.parameters.names)}, "
@@ -75,8 +81,8 @@ class Learned:
                 f"features must be of the contexts {', '.join(self.contexts.names)}, "
                 f"got {self.features.context_dim} variables"
             )
-        single = (checks.converted(values, np.dtype(np.float32)) for values in policy)
-        object.__setattr__(self, "policy", gaussian.checked("policy", LinearGaussian(*single), self.features))
+        single = jax.tree.map(lambda values: checks.converted(values, np.dtype(np.float32)), policy)
+        object.__setattr__(self, "policy", _checked_policy(single, self.features))
         try:
             task = json.loads(json.dumps(dict(self.task)))
         except (TypeError, ValueError) as error:
@@ -121,7 +127,10 @@ class Learned:
             ValueError: As calling does.
         """
         numbers = jnp.asarray(self.contexts.checked(self._values(context, named)), jnp.float32)
-        return np.asarray(self.features(numbers)) @ np.asarray(self.policy.coef)
+        features = self.features(numbers)
+        if isinstance(self.policy, NetworkGaussian):
+            return np.asarray(network_mean.mean_rows(self.policy, jnp.asarray(features)[None])[0])
+        return np.asarray(features) @ np.asarray(self.policy.coef)
 
     def in_range(self, *context: Any, **named: Any) -> bool:
         """Return whether a context is within the range that the policy was learned for.
@@ -137,7 +146,10 @@ class Learned:
 
     def thetas(self, contexts: Float[Array, "n s"]) -> Float[Array, "n d"]:
         """Return the parameters for many contexts; it can be jitted, and does not check the range."""
-        return self.parameters.inside(jnp.asarray(self.features(contexts)) @ self.policy.coef)
+        features = jnp.asarray(self.features(contexts))
+        if isinstance(self.policy, NetworkGaussian):
+            return self.parameters.inside(network_mean.mean_rows(self.policy, features))
+        return self.parameters.inside(features @ self.policy.coef)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a policy file, see `save`."""
@@ -152,6 +164,17 @@ class Learned:
             return tuple(named[name] for name in names)
         is_sequence = len(context) == 1 and np.ndim(context[0]) == 1 and not isinstance(context[0], str)
         return tuple(context[0]) if is_sequence else context
+
+
+def linear_policy(learned: Learned, use: str) -> LinearGaussian:
+    """Return the policy of a `Learned` for a use that needs one that is linear in features.
+
+    Raises:
+        ValueError: If it is a network.
+    """
+    if isinstance(learned.policy, LinearGaussian):
+        return learned.policy
+    raise UserError(f"policy must be linear in features to {use}, got a network")
 
 
 def save(path: str | os.PathLike[str], learned: Learned) -> None:
@@ -171,13 +194,17 @@ def save(path: str | os.PathLike[str], learned: Learned) -> None:
     checks.instance("learned", learned, Learned)
     arrays = {
         "format": FORMAT,
-        "version": VERSION,
+        "version": VERSION if isinstance(learned.policy, LinearGaussian) else _NETWORK_VERSION,
         "coef": np.asarray(learned.policy.coef, np.float32),
         "cov_chol": np.asarray(learned.policy.cov_chol, np.float32),
         "features": json.dumps(feature_maps.describe(learned.features)),
         "constraint": learned.parameters.constraint,
         "task": json.dumps(dict(learned.task)),
     }
+    if isinstance(learned.policy, NetworkGaussian):
+        arrays["num_layers"] = len(learned.policy.layers)
+        for index, layer in enumerate(learned.policy.layers):
+            arrays |= {f"{name}_{index}": values for name, values in layer._asdict().items()}
     for name, ends, space in (
         ("context", "range", learned.contexts),
         ("param", "bounds", learned.parameters),
@@ -204,7 +231,7 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
         got = arrays.get("format", "no format")
         raise UserError(f"{file} must be a policy file of format {FORMAT!r}, got {got}")
     if str(arrays.get("version")) not in _READABLE:
-        expected = " or ".join(_READABLE)
+        expected = " or ".join((", ".join(_READABLE[:-1]), _READABLE[-1]))
         got = arrays.get("version", "no version")
         raise UserError(f"{file} must be a policy file of version {expected}, got {got}")
     try:
@@ -213,7 +240,7 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
         constraint = str(arrays["constraint"])
         constraint = CLIP if constraint == _CLIP_BEFORE else constraint
         return Learned(
-            LinearGaussian(jnp.asarray(arrays["coef"]), jnp.asarray(arrays["cov_chol"])),
+            _policy(arrays),
             _features(json.loads(str(arrays["features"])), (context_low, context_high), features),
             _space(arrays, "context", context_low, context_high, CLIP),
             _space(arrays, "param", param_low, param_high, constraint),
@@ -223,6 +250,37 @@ def load(path: str | os.PathLike[str], *, features: FeatureMap | None = None) ->
         raise UserError(f"{file} is an incomplete policy file: it has no {error}") from error
     except (TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{file}: {error}") from error
+
+
+def _policy(arrays: Mapping[str, np.ndarray]) -> LinearGaussian | NetworkGaussian:
+    """Make the policy of a file: a network in a file of its version."""
+    is_network = str(arrays["version"]) == str(_NETWORK_VERSION)
+    layers = _layers(arrays, arrays["num_layers"]) if is_network else ()
+    known = [f"{name}_{index}" for index in range(len(layers)) for name in Layer._fields]
+    unknown = sorted({name for name in arrays if name.startswith(("weight_", "bias_"))}.difference(known))
+    if unknown:
+        raise ValueError(f"the arrays of layers must be {', '.join(known) or 'none'}, got {unknown[0]}")
+    coef, cov_chol = jnp.asarray(arrays["coef"]), jnp.asarray(arrays["cov_chol"])
+    return NetworkGaussian(layers, coef, cov_chol) if is_network else LinearGaussian(coef, cov_chol)
+
+
+def _layers(arrays: Mapping[str, np.ndarray], num: np.ndarray) -> tuple[Layer, ...]:
+    if num.shape != () or num.dtype.kind not in "iu" or num < 1:
+        raise ValueError(f"num_layers must be a whole number of at least 1, got {num.tolist()}")
+    names = ([f"{name}_{index}" for name in Layer._fields] for index in range(int(num)))
+    return tuple(Layer(*(checks.array(name, arrays[name]) for name in each)) for each in names)
+
+
+def _checked_policy(policy: Any, features: FeatureMap) -> LinearGaussian | NetworkGaussian:
+    """Return a policy in one precision, after checking that it fits the features."""
+    if isinstance(policy, LinearGaussian):
+        return gaussian.checked("policy", policy, features)
+    if not isinstance(features.apply, ScaledPolynomial):
+        raise ValueError(
+            "features of a network must be those of its network_policy, polynomials of the scaled context, "
+            f"got {checks.shown(features)}"
+        )
+    return network_mean.checked("policy", policy, features)
 
 
 def _space(

@@ -7,7 +7,7 @@ is a `LinearGaussian`, whose functions it uses.
 
 import math
 import numbers
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,9 +18,10 @@ from creps_jax.numerics.linalg import divided
 from creps_jax.policies import gaussian
 from creps_jax.policies.base import Policy
 from creps_jax.policies.features import FeatureMap, scaled_polynomial_features
-from creps_jax.policies.gaussian import LinearGaussian, start_policy
-from creps_jax.policies.network_fit import NetworkFit, units
-from creps_jax.typing import Array, Float, PRNGKey, Scalar, VectorLike
+from creps_jax.policies.gaussian import start_policy
+from creps_jax.policies.network_fit import NetworkFit
+from creps_jax.policies.network_mean import Layer, NetworkGaussian, checked, in_units, mean_rows, units
+from creps_jax.typing import Array, PRNGKey, Scalar, VectorLike
 
 __all__ = ["Layer", "NetworkGaussian", "network_policy", "start_network"]
 
@@ -28,24 +29,6 @@ _BASELINE_DEGREE = 2
 """Degree of the features, which also serve as those of the baseline."""
 _MOST_UNITS = 10_000
 """Largest number of units of a layer."""
-
-
-class Layer(NamedTuple):
-    """A layer of tanh units: `tanh(x weight + bias)`."""
-
-    weight: Float[Array, "i o"]
-    bias: Float[Array, " o"]
-
-
-class NetworkGaussian(NamedTuple):
-    """The policy pi(theta | s) = N(theta | coef' h(s), cov_chol cov_chol')."""
-
-    layers: tuple[Layer, ...]
-    """The layers of tanh units, from the context on."""
-    coef: Float[Array, "k d"]
-    """One row for the constant, and one for each unit of the last layer; one column for each parameter."""
-    cov_chol: Float[Array, "d d"]
-    """The lower Cholesky factor of the covariance; its diagonal is positive."""
 
 
 @checks.arguments
@@ -97,7 +80,7 @@ def network_policy(
     fit = NetworkFit(steps, learning_rate, mean_kl_bound, cov_kl_bound, entropy_loss_bound)
     return Policy(
         scaled_polynomial_features(low, high, _BASELINE_DEGREE),
-        mean=_mean,
+        mean=mean_rows,
         sample=_sample,
         log_prob=_log_prob,
         kl=_kl,
@@ -105,7 +88,7 @@ def network_policy(
         fit=fit,
         blend=gaussian.blend,
         noise=_noise,
-        checked=_checked,
+        checked=checked,
     )
 
 
@@ -166,60 +149,25 @@ def _no_function(context: Array) -> Array:
     raise NotImplementedError
 
 
-def _linear(state: NetworkGaussian) -> LinearGaussian:
-    """Return the policy as one that is linear in the units of the last layer."""
-    return LinearGaussian(state.coef, state.cov_chol)
-
-
-def _mean(state: NetworkGaussian, features: Array) -> Array:
-    return gaussian.mean_rows(_linear(state), units(state.layers, features))
-
-
 def _sample(key: PRNGKey, state: NetworkGaussian, features: Array) -> Array:
-    return gaussian.sample_rows(key, _linear(state), units(state.layers, features))
+    return gaussian.sample_rows(key, in_units(state), units(state.layers, features))
 
 
 def _log_prob(state: NetworkGaussian, features: Array, theta: Array) -> Array:
-    return gaussian.log_prob_rows(_linear(state), units(state.layers, features), theta)
+    return gaussian.log_prob_rows(in_units(state), units(state.layers, features), theta)
 
 
 def _kl(state: NetworkGaussian, reference: NetworkGaussian, features: Array) -> Array:
     # Only the shift of the mean depends on the context.
-    linear = _linear(state)
-    without_shift = gaussian.kl(linear, _linear(reference), jnp.zeros_like(linear.coef[:, 0]))
-    shifts = divided(_mean(state, features) - _mean(reference, features), reference.cov_chol.T)
+    linear = in_units(state)
+    without_shift = gaussian.kl(linear, in_units(reference), jnp.zeros_like(linear.coef[:, 0]))
+    shifts = divided(mean_rows(state, features) - mean_rows(reference, features), reference.cov_chol.T)
     return without_shift + 0.5 * jnp.sum(shifts**2, axis=1)
 
 
 def _entropy(state: NetworkGaussian) -> Scalar:
-    return gaussian.entropy(_linear(state))
+    return gaussian.entropy(in_units(state))
 
 
 def _noise(state: NetworkGaussian, features: Array, theta: Array) -> Array:
-    return gaussian.whitened(_linear(state), units(state.layers, features), theta)
-
-
-def _checked(name: str, state: Any, features: FeatureMap) -> NetworkGaussian:
-    """Return a state in one precision, after checking that it fits the features.
-
-    Raises:
-        ValueError: If it does not, is not finite, or `cov_chol` is no Cholesky factor.
-    """
-    checks.instance(name, state, NetworkGaussian)
-    if not isinstance(state.layers, tuple) or not state.layers:
-        raise ValueError(f"{name}.layers must be a tuple of layers, got {checks.shown(state.layers)}")
-    size, layers = features.context_dim, []
-    for index, layer in enumerate(state.layers):
-        checks.instance(f"{name}.layers[{index}]", layer, Layer)
-        weight = checks.array(f"{name}.layers[{index}].weight", layer.weight, (size, "o"))
-        size = weight.shape[1]
-        layers.append(Layer(weight, checks.array(f"{name}.layers[{index}].bias", layer.bias, (size,))))
-    coef = checks.array(f"{name}.coef", state.coef, (1 + size, "d"))
-    cov_chol = checks.array(f"{name}.cov_chol", state.cov_chol, (coef.shape[1],) * 2)
-    state = NetworkGaussian(tuple(layers), coef, cov_chol)
-    dtype = jnp.result_type(*jax.tree.leaves(state))
-    for path, leaf in jax.tree.leaves_with_path(state):
-        checks.finite(name + jax.tree_util.keystr(path), leaf)
-    state = jax.tree.map(lambda leaf: checks.converted(leaf, dtype), state)
-    gaussian.check_cov_chol(f"{name}.cov_chol", state.cov_chol)
-    return state
+    return gaussian.whitened(in_units(state), units(state.layers, features), theta)

@@ -15,10 +15,11 @@ from jax import lax
 from creps_jax.numerics.linalg import divided, exact_dot, normalised
 from creps_jax.policies.base import WeightedSamples
 from creps_jax.policies.bounded_covariance import as_cov_chol, bounded_factor
+from creps_jax.policies.network_mean import Layers, units
 from creps_jax.policies.regression import regress
 from creps_jax.typing import Array, Bool, Float, Scalar
 
-__all__ = ["NetworkFit", "units"]
+__all__ = ["NetworkFit"]
 
 _NUM_TRIALS, _NUM_REFINEMENTS = 32, 3
 """Number of steps that are tried at once, and how often, to find the largest one within the bound."""
@@ -26,18 +27,6 @@ _PENALTY = 10.0
 """Penalty in the loss on each nat by which the change of the mean exceeds its bound."""
 _RIDGE = 1e-4
 """Ridge of the regression that counts how much of the scatter the mean has used."""
-
-Layers = Any
-"""A pair of weight and bias for each layer, such as the `layers` of a `NetworkGaussian`."""
-
-
-def units(layers: Layers, features: Float[Array, "n p"]) -> Float[Array, "n k"]:
-    """Return the constant and the outputs of the last layer for the features of n contexts."""
-    # The features are the constant, the scaled context, and its products.
-    outputs = features[:, 1 : 1 + layers[0][0].shape[0]]
-    for weight, bias in layers:
-        outputs = jnp.tanh(exact_dot(outputs, weight) + bias[None, :])
-    return jnp.concatenate([features[:, :1], outputs], axis=1)
 
 
 class _Weights(NamedTuple):

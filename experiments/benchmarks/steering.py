@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import tyro
 
+from creps_jax.policies.learned import linear_policy
 from creps_jax.tools import tables
 from creps_jax.tools.command_line import answer
 from creps_jax.tools.drive import default_policy
@@ -37,7 +38,7 @@ def main(policy: tyro.conf.Positional[Path | None] = None, drives: int = 50, see
         acceleration=tuple(learned.task["acceleration"]),
     )
     keys = jax.random.split(jax.random.key(seed), 4)
-    arrays = steer.evaluate_policy(settings, learned.policy, tuple(keys))
+    arrays = steer.evaluate_policy(settings, linear_policy(learned, "be compared"), tuple(keys))
     print(tables.to_markdown(steer.table(arrays)))
     columns = {
         "metric": [claim.metric for claim in steer.CLAIMS],

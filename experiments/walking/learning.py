@@ -10,7 +10,7 @@ import numpy as np
 from creps_jax.errors import UserError
 from creps_jax.policies.bounds import CLIP, PENALTY, SIGMOID
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
-from creps_jax.policies.learned import Learned
+from creps_jax.policies.learned import Learned, linear_policy
 from creps_jax.policies.space import Space, sigmoid_gate
 from creps_jax.search.creps import Creps, CrepsState, creps
 from creps_jax.search.fit import fit_within
@@ -142,7 +142,7 @@ def first_policy(settings: Settings) -> LinearGaussian:
         wanted = settings.features.make(*settings.context_range()), parameter_space(settings)
         if (learned.features, learned.parameters) != wanted:
             raise UserError(f"{settings.start_policy} has other features or bounds than these settings")
-        return learned.policy
+        return linear_policy(learned, "be learned further")
     features = settings.features.make(*settings.context_range())
     mean, std = (
         jnp.full(len(PARAM_NAMES), settings.start_mean),

@@ -22,6 +22,7 @@ from creps_jax.policies.features import (
 )
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned, load, save
+from creps_jax.policies.network import network_policy, start_network
 from creps_jax.policies.space import Space
 
 SPEED = Space(("speed",), (0.1,), (0.6,), ("m/s",))
@@ -76,6 +77,102 @@ def test_a_policy_comes_back_as_it_was_saved(tmp_path, name):
     assert_same(loaded, policy)
     grid = cj.context_grid(contexts.low, contexts.high, 5)
     np.testing.assert_array_equal(loaded.features(grid), policy.features(grid))
+
+
+KIND = network_policy((0.1, -5.0), (0.6, 5.0), steps=5)
+PLACE = Space(("speed", "slope"), (0.1, -5.0), (0.6, 5.0), ("m/s", "deg"))
+
+
+def make_network(hidden: int | tuple[int, ...] = (4, 4), parameters: Space = WALK) -> Learned:
+    state = start_network(jax.random.key(0), KIND.features, 2, hidden=hidden)
+    coef = jax.random.normal(jax.random.key(1), state.coef.shape)
+    return Learned(state._replace(coef=coef), KIND.features, PLACE, parameters, {"name": "walk"})
+
+
+@pytest.mark.parametrize("hidden", [1, 32, (4, 4), (5, 3, 2)])
+def test_a_network_comes_back_as_it_was_saved(tmp_path, hidden):
+    learned = make_network(hidden)
+    learned.save(tmp_path / "policy.npz")
+    loaded = cj.load(tmp_path / "policy.npz")
+    assert_same(loaded, learned)
+    assert loaded(0.3, 1.0) == learned(speed=0.3, slope=1.0)
+    assert str(files.load_arrays(tmp_path / "policy.npz")["version"]) == "4"
+
+
+def test_parameters_of_a_network_are_its_squashed_mean():
+    learned = make_network()
+    contexts = np.float32([[0.1, -5.0], [0.6, 5.0], [0.35, 0.0], [0.2, 3.0]])
+    outputs = (contexts - np.float32([0.35, 0.0])) / np.float32([0.25, 5.0])
+    for weight, bias in learned.policy.layers:
+        outputs = np.tanh(outputs @ np.asarray(weight) + np.asarray(bias))
+    means = np.column_stack([np.ones(4), outputs]) @ np.asarray(learned.policy.coef)
+    expected = np.array(WALK.low) + np.subtract(WALK.high, WALK.low) / (1 + np.exp(-means))
+    np.testing.assert_allclose(jax.jit(learned.thetas)(contexts), expected, rtol=1e-4, atol=1e-5)
+    for context, mean, theta in zip(contexts.tolist(), means, expected, strict=True):
+        np.testing.assert_allclose(learned.mean(*context), mean, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(learned.theta(*context), theta, rtol=1e-4, atol=1e-5)
+        assert list(learned(context).values()) == learned.theta(context).tolist()
+    assert learned.in_range(0.3, 5.0) and not learned.in_range(0.3, 5.1)
+    with pytest.raises(ValueError, match=r"slope must be within its range, -5 to 5 deg, got 6"):
+        learned(0.3, 6.0)
+
+
+def test_a_search_with_a_network_gives_a_policy_that_can_be_saved(tmp_path, key):
+    kind = network_policy((-1.5, -1.5), (-0.5, -0.5), steps=5)
+    task, algorithm = cj.via_point_reaching(), cj.creps(kind, archive_size=60)
+    start = start_network(key, kind.features, task.theta_dim, hidden=4)
+    state, _ = cj.train(key, task, algorithm, start, iterations=3, samples=20)
+    learned = cj.learned(task, algorithm, state, made_for={"name": "reaching"})
+    learned.save(tmp_path / "reach.npz")
+    loaded = cj.load(tmp_path / "reach.npz")
+    assert_same(loaded, learned)
+    contexts = cj.context_grid((-1.5, -1.5), (-0.5, -0.5), 3)
+    expected = task.parameters.inside(algorithm.mean(state, contexts))
+    np.testing.assert_allclose(loaded.thetas(contexts), expected, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"num_layers": None}, "incomplete policy file: it has no 'num_layers'"),
+        ({"num_layers": np.array(0)}, "num_layers must be a whole number of at least 1, got 0"),
+        ({"num_layers": np.array(1.0)}, "num_layers must be a whole number of at least 1, got 1.0"),
+        ({"num_layers": np.array([2])}, r"num_layers must be a whole number of at least 1, got \[2\]"),
+        ({"num_layers": np.array(1)}, "the arrays of layers must be weight_0, bias_0, got bias_1"),
+        ({"num_layers": np.array(2**40)}, "incomplete policy file: it has no 'weight_2'"),
+        ({"weight_2": np.ones((4, 4))}, "the arrays of layers must be .*, bias_1, got weight_2"),
+        ({"bias_x": np.ones(4)}, "the arrays of layers must be .*, bias_1, got bias_x"),
+        ({"version": 3}, "the arrays of layers must be none, got bias_0"),
+        ({"weight_1": None}, "incomplete policy file: it has no 'weight_1'"),
+        ({"weight_0": np.ones((3, 4))}, r"layers\[0\]\.weight must have shape \(2, o\), got \(3, 4\)"),
+        ({"weight_1": np.ones((4, 0))}, r"layers\[1\]\.weight must have shape \(4, o\), got \(4, 0\)"),
+        ({"bias_1": np.ones(3)}, r"layers\[1\]\.bias must have shape \(4,\), got \(3,\)"),
+        ({"bias_0": np.array(["a"] * 4)}, "bias_0 must be"),
+        ({"weight_0": np.full((2, 4), np.nan)}, "weight must be finite, got nan"),
+        ({"weight_0": np.full((2, 4), 1e300)}, "weight must be finite, got inf"),
+        ({"coef": np.ones((4, 2))}, r"policy\.coef must have shape \(5, d\), got \(4, 2\)"),
+        ({"cov_chol": -np.eye(2)}, "the diagonal of policy.cov_chol must be"),
+        (
+            {"features": json.dumps({"kind": "linear", "dim": 2})},
+            "features of a network must be those of its network_policy",
+        ),
+    ],
+)
+def test_broken_arrays_of_a_network_are_named(tmp_path, changes, match):
+    path = tmp_path / "policy.npz"
+    make_network().save(path)
+    arrays = {**files.load_arrays(path), **changes}
+    files.save_arrays(path, {name: values for name, values in arrays.items() if values is not None})
+    with pytest.raises(UserError, match=rf"policy\.npz.*{match}") as caught:
+        load(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_fields_that_do_not_fit_a_network_are_refused():
+    with pytest.raises(ValueError, match=r"must have a column of coef for each of c, got coef \(5, 2\)"):
+        dataclasses.replace(make_network(), parameters=Space(("c",), (0.0,), (1.0,)))
+    with pytest.raises(ValueError, match="features of a network must be those of its network_policy"):
+        dataclasses.replace(make_network(), features=rbf_features((0.1, -5.0), (0.6, 5.0), 3))
 
 
 def test_features_of_a_user_need_a_name_and_come_along(tmp_path):
@@ -252,7 +349,7 @@ def test_foreign_files_and_other_versions_are_refused(tmp_path):
     save(path, make_policy())
     whole = files.load_arrays(path)
     files.save_arrays(path, {**whole, "version": 1})
-    with pytest.raises(UserError, match="must be a policy file of version 2 or 3, got 1"):
+    with pytest.raises(UserError, match="must be a policy file of version 2, 3 or 4, got 1"):
         load(path)
     for name in whole.keys() - {"format", "version"}:
         files.save_arrays(path, {key: values for key, values in whole.items() if key != name})

@@ -23,6 +23,7 @@ from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import describe, linear_features, quadratic_features
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned, load, save
+from creps_jax.policies.network import network_policy, start_network
 from creps_jax.policies.space import Space
 from creps_jax.robots.nao_geometry import JOINT_LOWER, JOINT_NAMES, JOINT_UPPER, MAX_JOINT_SPEED
 from creps_jax.robots.robot import NAO_H25
@@ -239,6 +240,15 @@ def test_features_that_cannot_be_exported_are_named(make):
         UserError, match="features must be linear, polynomial, rbf or kernel to be exported, got quadratic"
     ):
         make(Learned(policy, features, contexts, POLICIES["free"].parameters))
+
+
+@pytest.mark.parametrize("make", [make_model, make_header])
+def test_a_network_is_not_exported(make):
+    policy = POLICIES["free"]
+    features = network_policy(policy.contexts.low, policy.contexts.high).features
+    state = start_network(jax.random.key(0), features, 3, hidden=4)
+    with pytest.raises(UserError, match="policy must be linear in features to be exported, got a network"):
+        make(dataclasses.replace(policy, policy=state, features=features))
 
 
 def test_parameters_without_bounds_are_exported():

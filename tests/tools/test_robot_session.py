@@ -24,6 +24,7 @@ from creps_jax.errors import UserError
 from creps_jax.policies.features import polynomial_features, rbf_features, scaled_polynomial_features
 from creps_jax.policies.gaussian import LinearGaussian
 from creps_jax.policies.learned import Learned, load
+from creps_jax.policies.network import network_policy, start_network
 from creps_jax.policies.space import Space
 from creps_jax.search.archive import Batch
 from creps_jax.search.creps import creps
@@ -560,6 +561,11 @@ def test_a_session_from_a_policy_begins_with_it(tmp_path):
         match="must begin with linear or polynomial features, or with scaled polynomials, RBFs",
     ):
         RobotSession.create(tmp_path / "other", policy=elsewhere)
+    features = network_policy(policy.contexts.low, policy.contexts.high).features
+    state = start_network(jax.random.key(0), features, 2, hidden=2)
+    network = dataclasses.replace(policy, policy=state, features=features)
+    with pytest.raises(UserError, match="must be linear in features to begin a session, got a network"):
+        RobotSession.create(tmp_path / "other", policy=network)
     for exploration in (0.0, -1.0, math.nan, math.inf):
         with pytest.raises(UserError, match="exploration must be above zero and finite"):
             RobotSession.create(tmp_path / "new", policy=policy, exploration=exploration)

@@ -8,7 +8,7 @@ import numpy as np
 from creps_jax.errors import UserError
 from creps_jax.policies.feature_functions import Kernel, middle_and_half
 from creps_jax.policies.features import describe, rbf_grid
-from creps_jax.policies.learned import Learned
+from creps_jax.policies.learned import Learned, linear_policy
 
 
 class Formula(NamedTuple):
@@ -49,13 +49,14 @@ def formula_of(learned: Learned) -> Formula:
     """Return the numbers of a policy, whose features must be linear, polynomial, RBFs or a kernel.
 
     Raises:
-        UserError: if its features cannot be exported, or a number is too large for single precision.
+        UserError: if it is a network, its features cannot be exported, or a number is too large for single
+            precision.
     """
+    coef = np.asarray(linear_policy(learned, "be exported").coef)
     num_contexts = learned.contexts.size
     middle, half = np.zeros(num_contexts), np.ones(num_contexts)
     exponents = np.zeros((0, num_contexts), np.int32)
     centers, widths = np.zeros((0, num_contexts)), np.ones(num_contexts)
-    coef = np.asarray(learned.policy.coef)
     features = describe(learned.features)
     kind = features.pop("kind")
     if kind == "rbf":

@@ -13,7 +13,7 @@ from creps_jax.policies.bounds import CLIP, SIGMOID
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import FeatureMap, describe
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
-from creps_jax.policies.learned import Learned
+from creps_jax.policies.learned import Learned, linear_policy
 from creps_jax.policies.space import Space
 from creps_jax.search.input_checks import samples_for_many_features
 from creps_jax.tools.session.plain import shortest
@@ -30,19 +30,20 @@ def settings_from_policy(learned: Learned, *, exploration: float = 1.0) -> Setti
         exploration: factor of its standard deviations.
 
     Raises:
-        UserError: if the factor is not positive and finite, or settings of a session cannot describe the
-            features.
+        UserError: if the policy is a network, the factor is not positive and finite, or settings of a session
+            cannot describe the features.
     """
+    policy = linear_policy(learned, "begin a session")
     if not (exploration > 0 and math.isfinite(exploration)):
         raise UserError(f"exploration must be above zero and finite, got {exploration}")
-    cov_chol = np.float32(exploration) * np.asarray(learned.policy.cov_chol, np.float32)
+    cov_chol = np.float32(exploration) * np.asarray(policy.cov_chol, np.float32)
     return Settings(
         contexts=_variables(Context, learned.contexts),
         parameters=_variables(Parameter, learned.parameters),
         features=_settings_of_features(learned),
         constraint=SIGMOID if learned.parameters.constraint == SIGMOID else CLIP,
         first_policy=FirstPolicy(
-            coef=tuple(tuple(shortest(row)) for row in learned.policy.coef),
+            coef=tuple(tuple(shortest(row)) for row in policy.coef),
             cov_chol=tuple(tuple(shortest(row)) for row in cov_chol),
         ),
         task=dict(learned.task),
