@@ -7,6 +7,7 @@ bounded fit, a short archive and the same baseline: only the mean of the policy 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -251,4 +252,39 @@ def plot(arrays: Arrays) -> dict[str, Figure]:
     return {"learning_curves": plots.learning_curves(panels, columns=min(len(panels), 2), share=False)}
 
 
-CLAIMS: tuple[Claim, ...] = ()
+def last_reward(arrays: Arrays, task: str, policy: str) -> float:
+    """Return the reward of the last mean policies of a task, the median of the trials; NaN if not learned."""
+    if task not in tasks_of(arrays):
+        return math.nan
+    return float(np.median(curves(arrays, task)[LABELS[policy]][1][:, -1]))
+
+
+def cost_of_rbfs(arrays: Arrays, task: str, policy: str) -> float:
+    """Return the cost, the reward with the other sign, of a policy, divided by the cost of the RBFs."""
+    return last_reward(arrays, task, policy) / last_reward(arrays, task, "rbf")
+
+
+CLAIMS = (
+    *(
+        Claim(
+            f"sine, {LABELS[policy]}: reward of the mean policy, median of trials (a policy of zero: -0.5)",
+            partial(last_reward, task="sinus", policy=policy),
+            low=low,
+        )
+        for policy, low in (("rbf", -0.005), ("kernel", -0.005), ("network", -0.2))
+    ),
+    *(
+        Claim(
+            f"{place}, {LABELS[policy]}: cost of the mean policy, divided by that of RBFs, medians of trials",
+            partial(cost_of_rbfs, task=task, policy=policy),
+            high=high,
+        )
+        for task, place, policy, high in (
+            ("reaching", "via-points", "network", 1.5),
+            ("reaching", "via-points", "polynomial", 2.0),
+            ("reaching", "via-points", "kernel", 4.0),
+            ("hole", "hole", "network", 1.2),
+            ("hole", "hole", "polynomial", 1.3),
+        )
+    ),
+)

@@ -55,3 +55,6 @@ class Policy(NamedTuple):
     thetas less the mean."""
     checked: Callable[[str, Any, FeatureMap], Any] | None = None
     """(name, state, features) -> the state in one precision, or a ValueError that names what is wrong."""
+    num_features: Callable[[Any], int] | None = None
+    """(state) -> number of features that the mean is linear in, from which a search takes the size of its
+    archive; by default that of `features`. A network has one for each unit of its last layer."""

@@ -44,8 +44,8 @@ def network_policy(
 ) -> Policy:
     """Make the kind of policy whose mean is a small network of the context.
 
-    `creps(network_policy(low, high), archive_size=...)` searches with it; `start_network` makes the first
-    state. Give the size of the archive: the default counts the features, not the units of the network.
+    `creps(network_policy(low, high))` searches with it; `start_network` makes the first state. The default
+    size of the archive is five samples for each unit of the last layer and each parameter.
 
     The fit takes a fixed number of steps of Adam from the old weights on the weighted log-likelihood, in
     which parameters are in units of the old covariance, whatever their own units. Then it goes back towards
@@ -89,6 +89,7 @@ def network_policy(
         blend=gaussian.blend,
         noise=_noise,
         checked=checked,
+        num_features=_num_features,
     )
 
 
@@ -167,6 +168,10 @@ def _kl(state: NetworkGaussian, reference: NetworkGaussian, features: Array) -> 
 
 def _entropy(state: NetworkGaussian) -> Scalar:
     return gaussian.entropy(in_units(state))
+
+
+def _num_features(state: NetworkGaussian) -> int:
+    return state.coef.shape[0]
 
 
 def _noise(state: NetworkGaussian, features: Array, theta: Array) -> Array:

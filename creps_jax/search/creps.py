@@ -176,11 +176,11 @@ def creps(
         kl_bound: Largest relative entropy epsilon of one update, in nats. Another value compiles nothing
             anew. Inside `jit`, where it cannot be checked, a bound that is not above 0 keeps the policy.
         archive_size: Number L of the last samples that are learned from; by default five for each policy
-            feature and parameter, or for each baseline feature if there are more of them. Two are
-            recommended: `init` warns of fewer. With more than 10 features of a linear policy, three for each
-            coefficient (features times parameters) are the least default and recommended. It refuses an
-            archive with less than one, and one that is not larger than the number of baseline features, which
-            could then explain all rewards.
+            feature (for a network: each unit of its last layer) and parameter, or for each baseline feature
+            if there are more of them. Two are recommended: `init` warns of fewer. With more than 10 features
+            of a linear policy, three for each coefficient (features times parameters) are the least default
+            and recommended. It refuses an archive with less than one for each feature and parameter, and one
+            that is not larger than the number of baseline features, which could then explain all rewards.
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale; 1e-4 by
             default.
         m_step: Fit of the policy to the weighted samples. `weighted_ml`, the paper's fit and the default,
@@ -231,12 +231,11 @@ def init(settings: CrepsSettings, policy: Any) -> CrepsState:
         UserWarning: If the archive is too small for reliable fits.
     """
     policy = checked_policy(settings, "policy", policy)
-    is_linear = isinstance(policy, LinearGaussian)
-    if is_linear:
+    if isinstance(policy, LinearGaussian):
         for field, values in policy._asdict().items():
             checks.finite(f"policy.{field}", values, largest=_LARGEST[field])
     dim = theta_dim_of(settings, policy)
-    archive_size = checked_archive_size(settings, dim, is_linear=is_linear)
+    archive_size = checked_archive_size(settings, policy, dim)
     archive = empty_archive(archive_size, settings.kind.features.context_dim, dim, precision_of(policy))
     importance = settings.importance
     history = None if importance is None else empty_history(policy, importance.num_policies)

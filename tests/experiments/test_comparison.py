@@ -129,6 +129,8 @@ def test_policies_are_compared_on_the_same_problem(tmp_path):
     again = policies.run(settings, jax.random.key(0), Session(tmp_path))
     for name, values in arrays.items():
         np.testing.assert_array_equal(again[name], values)
+    for claim in policies.CLAIMS:
+        assert np.isfinite(claim.measure(arrays)) == (not claim.metric.startswith("via-points"))
     columns = policies.table(arrays)
     assert columns["task"] == ["sinus", "hole"] and list(columns)[1:] == list(policies.LABELS.values())
     assert set(policies.plot(arrays)) == {"learning_curves"}

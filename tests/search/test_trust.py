@@ -190,6 +190,27 @@ def test_the_features_of_a_network_are_not_its_coefficients():
         creps(kind, archive_size=400).init(start)
 
 
+@pytest.mark.parametrize(
+    ("hidden", "num_baseline", "archive_size"), [(32, 2, 190), (8, 2, 70), ((64, 4), 2, 50), (2, 12, 60)]
+)
+def test_the_default_archive_of_a_network_has_five_samples_for_each_last_unit(
+    hidden, num_baseline, archive_size
+):
+    kind = network_policy((-1.0, -1.0), (1.0, 1.0))
+    start = start_network(jax.random.key(0), kind.features, 5, hidden=hidden)
+    baseline = rbf_features((-1.0, -1.0), (1.0, 1.0), (num_baseline, 1))
+    assert len(creps(kind, baseline).init(start).archive.batch.reward) == archive_size
+
+
+def test_a_small_archive_of_a_network_is_warned_of():
+    kind = network_policy((-1.0, -1.0), (1.0, 1.0))
+    start = start_network(jax.random.key(0), kind.features, 5, hidden=32)
+    with pytest.warns(UserWarning, match="archive_size should be at least 76, 2 samples for each of 33 feat"):
+        creps(kind, archive_size=75).init(start)
+    with pytest.raises(ValueError, match="archive_size must be at least 11, the number of features"):
+        creps(kind, archive_size=10).init(start)
+
+
 def test_few_features_are_not_warned_of():
     features = rbf_features((0.0, 0.0), (1.0, 1.0), (5, 2))
     with warnings.catch_warnings():
