@@ -61,6 +61,16 @@ def make_policy(name: str, features: Features, constraint: str, *, num_contexts:
     )
 
 
+def make_network(
+    name: str, hidden: int | tuple[int, ...], constraint: str, *, num_contexts: int = 2
+) -> Learned:
+    other = make_policy(name, Features("linear"), constraint, num_contexts=num_contexts)
+    features = network_policy(other.contexts.low, other.contexts.high).features
+    state = start_network(jax.random.key(0), features, 3, hidden=hidden)
+    coef = jax.random.normal(jax.random.key(1), state.coef.shape)
+    return dataclasses.replace(other, policy=state._replace(coef=coef), features=features)
+
+
 POLICIES = {
     policy.task["name"]: policy
     for policy in (
@@ -74,6 +84,9 @@ POLICIES = {
         make_policy("smooth", Features("kernel", num_points=8), "sigmoid"),
         make_policy("point", Features("kernel", num_points=1), "clip"),
         make_policy("near", Features("kernel", num_points=12, bandwidth=0.05), "clip", num_contexts=1),
+        make_network("net", 32, "sigmoid"),
+        make_network("deep", (5, 1, 7), "clip"),
+        make_network("unit", 1, "none", num_contexts=1),
         make_policy("free", Features("linear"), "none"),
         load(SHIPPED),
     )
@@ -242,15 +255,6 @@ def test_features_that_cannot_be_exported_are_named(make):
         make(Learned(policy, features, contexts, POLICIES["free"].parameters))
 
 
-@pytest.mark.parametrize("make", [make_model, make_header])
-def test_a_network_is_not_exported(make):
-    policy = POLICIES["free"]
-    features = network_policy(policy.contexts.low, policy.contexts.high).features
-    state = start_network(jax.random.key(0), features, 3, hidden=4)
-    with pytest.raises(UserError, match="policy must be linear in features to be exported, got a network"):
-        make(dataclasses.replace(policy, policy=state, features=features))
-
-
 def test_parameters_without_bounds_are_exported():
     free = Space(NAMES, (-math.inf,) * 3, (math.inf,) * 3)
     policy = dataclasses.replace(POLICIES["free"], parameters=free)
@@ -327,6 +331,17 @@ def test_a_steered_walk_with_a_condition_is_written(folder):
         == 0
     )
     assert main(["export", "--policy", "wider.npz", "--to", "walk.c"]) == 0
+
+
+def test_a_walk_of_a_network_is_written(folder):
+    learned = load(SHIPPED)
+    features = network_policy(learned.contexts.low, learned.contexts.high).features
+    middle = learned.mean(0.3)
+    state = start_network(jax.random.key(0), features, len(middle), hidden=3, mean=middle)
+    save(folder / "net.npz", dataclasses.replace(learned, policy=state, features=features))
+    for arguments in (["--to", "walk.csv", "--speed", "0.3", "--duration", "1"], ["--to", "walk.c"]):
+        assert main(["export", "--policy", "net.npz", *arguments]) == 0
+    assert "tanhf" in (folder / "walk.c").read_text()
 
 
 def test_a_robot_gets_its_own_policy_and_set_points(folder, capsys):

@@ -18,6 +18,8 @@ from creps_jax.files import policies_folder
 from creps_jax.policies.feature_settings import Features
 from creps_jax.policies.features import polynomial_features
 from creps_jax.policies.learned import load
+from creps_jax.policies.network import network_policy, start_network
+from creps_jax.policies.network_mean import units
 from creps_jax.policies.space import Space
 from creps_jax.robots.mjcf import humanoid_from_mjcf
 from creps_jax.robots.nao_geometry import JOINT_NAMES
@@ -116,6 +118,21 @@ def test_set_points_are_those_of_python(walk, period, tmp_path):
 def test_set_points_of_other_features_are_those_of_python(features, tmp_path):
     policy = policy_of(*WALKS["steered"])
     other = with_features(policy, features.make(policy.contexts.low, policy.contexts.high))
+    assert_equal_walks(other, NAO, 0.02, 8.0, tmp_path)
+
+
+@needs_compiler
+@pytest.mark.parametrize("hidden", [8, (3, 4)])
+def test_set_points_of_a_network_are_those_of_python(hidden, tmp_path):
+    policy = policy_of(*WALKS["steered"])
+    low, high = policy.contexts.low, policy.contexts.high
+    features = network_policy(low, high).features
+    state = start_network(jax.random.key(0), features, policy.parameters.size, hidden=hidden)
+    contexts = context_grid(low, high, 6)
+    last = units(state.layers, features(contexts))
+    means = policy.features(contexts) @ policy.policy.coef
+    coef = np.linalg.lstsq(np.asarray(last), np.asarray(means), rcond=1e-2)[0]
+    other = dataclasses.replace(policy, policy=state._replace(coef=coef), features=features)
     assert_equal_walks(other, NAO, 0.02, 8.0, tmp_path)
 
 

@@ -1,6 +1,9 @@
 """Templates of the C code of a policy; `c_header` fills them in."""
 
+from collections.abc import Sequence
 from string import Template
+
+from creps_jax.policies.network_mean import Layer
 
 HEADER = Template("""\
 /* Parameters for a context, by a policy that was learned with creps_jax $version.
@@ -10,7 +13,7 @@ HEADER = Template("""\
  *     int is_in_range = ${prefix}_policy(context, parameters);
  *     ... parameters[$first] ...
  *
- * C99 or C++. Needs expf of <math.h>; allocates nothing. To tell NaN, compile without -ffast-math.
+ * C99 or C++. Needs $functions of <math.h>; allocates nothing. To tell NaN, compile without -ffast-math.
  */
 #ifndef ${PREFIX}_POLICY_H
 #define ${PREFIX}_POLICY_H
@@ -68,11 +71,16 @@ LINEAR = """\
     }
 """
 
-POLYNOMIAL = """\
+SCALED = """\
     float scaled[${PREFIX}_NUM_CONTEXTS];
     for (j = 0; j < ${PREFIX}_NUM_CONTEXTS; ++j) {
         scaled[j] = (nearest[j] - ${prefix}_middle[j]) / ${prefix}_half[j];
     }
+"""
+
+POLYNOMIAL = (
+    SCALED
+    + """\
     for (i = 0; i < ${PREFIX}_NUM_FEATURES; ++i) {
         features[i] = 1.0f;
         for (j = 0; j < ${PREFIX}_NUM_CONTEXTS; ++j) {
@@ -83,6 +91,7 @@ POLYNOMIAL = """\
         }
     }
 """
+)
 
 # The largest exponent is subtracted from all, so that the weights cannot all be zero.
 RBF = """\
@@ -117,6 +126,47 @@ KERNEL = """\
         features[i] = expf(-0.5f * square);
     }
 """
+
+# Whole layers follow each other; `network` puts in the names and sizes of each.
+_LAYER = Template("""\
+    float units_$index[$num_units];
+    for (i = 0; i < $num_units; ++i) {
+        units_$index[i] = ${bias}[i];
+        for (j = 0; j < $num_inputs; ++j) {
+            units_$index[i] += $inputs[j] * ${weight}[j][i];
+        }
+        units_$index[i] = tanhf(units_$index[i]);
+    }
+""")
+_LAST_UNITS = Template("""\
+    features[0] = 1.0f;
+    for (i = 0; i < $num_units; ++i) {
+        features[i + 1] = units_$index[i];
+    }
+""")
+
+
+def network(layers: Sequence[Layer], prefix: str) -> str:
+    """Return the code that computes the features of a network from the array `scaled`.
+
+    Args:
+        layers: the layers.
+        prefix: what the names of their tables, `weight_0` and so on, begin with.
+    """
+    code, inputs = "", "scaled"
+    for index, layer in enumerate(layers):
+        num_inputs, num_units = layer.weight.shape
+        code += _LAYER.substitute(
+            index=index,
+            inputs=inputs,
+            num_inputs=num_inputs,
+            num_units=num_units,
+            weight=f"{prefix}weight_{index}",
+            bias=f"{prefix}bias_{index}",
+        )
+        inputs = f"units_{index}"
+    return code + _LAST_UNITS.substitute(index=len(layers) - 1, num_units=layers[-1].weight.shape[1])
+
 
 _BOUNDS = """\
         const float low = ${prefix}_parameter_low[j], high = ${prefix}_parameter_high[j];

@@ -10,7 +10,16 @@ import numpy as np
 
 from creps_jax.files import package_version, save_text
 from creps_jax.policies.learned import Learned
-from creps_jax.tools.export.c_code import HEADER, HOLD_BOUNDS, KERNEL, LINEAR, POLYNOMIAL, RBF
+from creps_jax.tools.export.c_code import (
+    HEADER,
+    HOLD_BOUNDS,
+    KERNEL,
+    LINEAR,
+    POLYNOMIAL,
+    RBF,
+    SCALED,
+    network,
+)
 from creps_jax.tools.export.formula import Formula, formula_of
 
 # Characters that need no escape in a C string: not quotes, backslashes, nor "?", as "??" starts a trigraph.
@@ -34,13 +43,15 @@ def make_header(policy: Learned, name: str | None = None) -> str:
     formula = formula_of(policy)
     prefix = _prefix(str(policy.task.get("name", "")) if name is None else name)
     names = {"prefix": prefix, "PREFIX": prefix.upper()}
-    features = {"linear": LINEAR, "polynomial": POLYNOMIAL, "rbf": RBF, "kernel": KERNEL}[formula.kind]
+    features = {"linear": LINEAR, "polynomial": POLYNOMIAL, "rbf": RBF, "kernel": KERNEL, "network": SCALED}
+    layers = network(formula.layers, f"{prefix}_") if formula.layers else ""
     is_bounded = policy.parameters.constraint != "none"
     held = f", within {prefix}_parameter_low to {prefix}_parameter_high" if is_bounded else ""
     middle = 0.5 * (formula.context_low + formula.context_high)
     return HEADER.substitute(
         names,
         version=package_version(),
+        functions="expf and tanhf" if formula.layers else "expf",
         example=", ".join(f"{value:g}" for value in middle),
         first=_enumerators(f"{prefix}_PARAMETER", policy.parameters.names)[0],
         num_contexts=len(policy.contexts.names),
@@ -48,7 +59,7 @@ def make_header(policy: Learned, name: str | None = None) -> str:
         num_features=len(formula.coef),
         tables=_tables(policy, formula, prefix),
         held=held,
-        compute_features=string.Template(features).substitute(names),
+        compute_features=string.Template(features[formula.kind]).substitute(names) + layers,
         hold_bounds=string.Template(HOLD_BOUNDS[policy.parameters.constraint]).substitute(names),
     )
 
@@ -75,12 +86,22 @@ def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
         num = features if formula.kind == "rbf" else f"{features} - 1"
         tables.append(floats(f"{prefix}_centers[{num}][{contexts}]", formula.centers))
         tables.append(floats(f"{prefix}_widths[{contexts}]", formula.widths))
-    elif formula.kind == "polynomial":
+    if formula.kind in ("polynomial", "network"):
         tables.append(floats(f"{prefix}_middle[{contexts}]", formula.middle))
         tables.append(floats(f"{prefix}_half[{contexts}]", formula.half))
+    if formula.kind == "polynomial":
         rows = [f"{{{', '.join(map(str, row))}}}" for row in formula.exponents.tolist()]
         tables.append(f"static const int {prefix}_exponents[{features}][{contexts}] = {{{_lines(rows)}}};\n")
-    return "\n".join(tables)
+    return "\n".join([*tables, *layer_tables(formula, f"{prefix}_")])
+
+
+def layer_tables(formula: Formula, prefix: str) -> list[str]:
+    """Declare the weights and biases of the layers of a network."""
+    return [
+        floats(f"{prefix}{name}_{index}{''.join(f'[{size}]' for size in values.shape)}", values)
+        for index, layer in enumerate(formula.layers)
+        for name, values in layer._asdict().items()
+    ]
 
 
 def _prefix(name: str) -> str:

@@ -3,12 +3,14 @@
 import itertools
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from creps_jax.errors import UserError
 from creps_jax.policies.feature_functions import Kernel, middle_and_half
 from creps_jax.policies.features import describe, rbf_grid
-from creps_jax.policies.learned import Learned, linear_policy
+from creps_jax.policies.learned import Learned
+from creps_jax.policies.network_mean import Layer, NetworkGaussian
 
 
 class Formula(NamedTuple):
@@ -17,19 +19,21 @@ class Formula(NamedTuple):
     All but the kind and the exponents are float32.
 
     Attributes:
-        kind: "linear", "polynomial", "rbf" or "kernel".
+        kind: "linear", "polynomial", "rbf", "kernel" or "network".
         context_low: (s,) lower ends of the learned range.
         context_high: (s,) upper ends of the learned range.
-        middle: (s,) subtracted from the context before its powers are taken; 0 for RBFs and kernels.
-        half: (s,) by which the difference is divided; 1 for RBFs and kernels.
+        middle: (s,) subtracted from the context of polynomials and networks; 0 for others.
+        half: (s,) by which the difference is divided; 1 for others.
         exponents: (p, s) int32 exponent of each scaled context variable in each linear or polynomial feature;
-            (0, s) for RBFs and kernels.
+            (0, s) for others.
         centers: (p, s) centres of the RBFs; (p - 1, s) inducing contexts of a kernel; (0, s) for others.
         widths: (s,) widths of the RBFs or the kernel.
         coef: (p, d) coefficients of the features; of a kernel, whose features are not whitened here, of the
-            constant and of the covariance with each inducing context.
+            constant and of the covariance with each inducing context; of a network, of the constant and of
+            the units of its last layer.
         param_low: (d,) lower bounds of the parameters.
         param_high: (d,) upper bounds.
+        layers: the layers of a network, from the scaled context on.
     """
 
     kind: str
@@ -43,23 +47,26 @@ class Formula(NamedTuple):
     coef: np.ndarray
     param_low: np.ndarray
     param_high: np.ndarray
+    layers: tuple[Layer, ...] = ()
 
 
 def formula_of(learned: Learned) -> Formula:
-    """Return the numbers of a policy, whose features must be linear, polynomial, RBFs or a kernel.
+    """Return the numbers of a policy, a network or one of linear features, polynomials, RBFs or a kernel.
 
     Raises:
-        UserError: if it is a network, its features cannot be exported, or a number is too large for single
-            precision.
+        UserError: if its features cannot be exported, or a number is too large for single precision.
     """
-    coef = np.asarray(linear_policy(learned, "be exported").coef)
+    coef, layers = np.asarray(learned.policy.coef), ()
     num_contexts = learned.contexts.size
     middle, half = np.zeros(num_contexts), np.ones(num_contexts)
     exponents = np.zeros((0, num_contexts), np.int32)
     centers, widths = np.zeros((0, num_contexts)), np.ones(num_contexts)
     features = describe(learned.features)
     kind = features.pop("kind")
-    if kind == "rbf":
+    if isinstance(learned.policy, NetworkGaussian):
+        middle, half = middle_and_half(features["low"], features["high"])
+        kind, layers = "network", jax.tree.map(np.asarray, learned.policy.layers)
+    elif kind == "rbf":
         centers, widths = rbf_grid(
             features["low"], features["high"], features["num_centers"], bandwidth=features["width"]
         )
@@ -88,12 +95,15 @@ def formula_of(learned: Learned) -> Formula:
         coef=coef,
         param_low=np.asarray(learned.parameters.low),
         param_high=np.asarray(learned.parameters.high),
+        layers=layers,
     )
     return _in_single_precision(numbers)
 
 
 def _in_single_precision(numbers: Formula) -> Formula:
-    arrays = {name: values for name, values in numbers._asdict().items() if name not in ("kind", "exponents")}
+    # A `Learned` has its layers in single precision.
+    kept = ("kind", "exponents", "layers")
+    arrays = {name: values for name, values in numbers._asdict().items() if name not in kept}
     with np.errstate(over="ignore"):
         single = {name: np.asarray(values, np.float32) for name, values in arrays.items()}
     for name, values in single.items():

@@ -34,7 +34,11 @@ def make_model(policy: Learned) -> onnx.ModelProto:
         UserError: if a number of the policy is too large for single precision.
     """
     formula = formula_of(policy)
-    nodes = [*_clamp(), *_mean(formula.kind), *_hold_bounds(policy.parameters.constraint)]
+    nodes = [
+        *_clamp(),
+        *_mean(formula.kind, len(formula.layers)),
+        *_hold_bounds(policy.parameters.constraint),
+    ]
     used = {name for node in nodes for name in node.input}
     constants = _constants(formula)
     tensors = [numpy_helper.from_array(values, name) for name, values in constants.items() if name in used]
@@ -73,8 +77,23 @@ def _clamp() -> list[onnx.NodeProto]:
     ]
 
 
-def _mean(kind: str) -> list[onnx.NodeProto]:
+def _mean(kind: str, num_layers: int) -> list[onnx.NodeProto]:
     """Compute `mean`, the parameters before any bounds are applied, from `nearest`."""
+    scaled = [_node("from_middle", "Sub", "nearest", "middle"), _node("scaled", "Div", "from_middle", "half")]
+    if kind == "network":
+        for index in range(num_layers):
+            scaled += [
+                _node(
+                    f"sum_{index}", "MatMul", f"units_{index - 1}" if index else "scaled", f"weight_{index}"
+                ),
+                _node(f"input_{index}", "Add", f"sum_{index}", f"bias_{index}"),
+                _node(f"units_{index}", "Tanh", f"input_{index}"),
+            ]
+        return [
+            *scaled,
+            _node("rise", "MatMul", f"units_{num_layers - 1}", "slope"),
+            _node("mean", "Add", "rise", "intercept"),
+        ]
     if kind == "linear":
         return [
             _node("rise", "MatMul", "nearest", "slope"),
@@ -82,8 +101,7 @@ def _mean(kind: str) -> list[onnx.NodeProto]:
         ]
     if kind == "polynomial":
         return [
-            _node("from_middle", "Sub", "nearest", "middle"),
-            _node("scaled", "Div", "from_middle", "half"),
+            *scaled,
             _node("row", "Unsqueeze", "scaled", "middle_axis"),
             _node("powers", "Pow", "row", "exponents"),
             _node("features", "ReduceProd", "powers", axes=[2], keepdims=0),
@@ -131,7 +149,9 @@ def _hold_bounds(constraint: str) -> list[onnx.NodeProto]:
 
 def _constants(formula: Formula) -> dict[str, np.ndarray]:
     """Return all constants that a node may use, by name."""
-    numbers = {name: values for name, values in formula._asdict().items() if name != "kind"}
+    numbers = {name: values for name, values in formula._asdict().items() if name not in ("kind", "layers")}
+    for index, layer in enumerate(formula.layers):
+        numbers |= {f"{name}_{index}": values for name, values in layer._asdict().items()}
     return numbers | {
         "intercept": formula.coef[0],
         "slope": formula.coef[1:],

@@ -15,8 +15,9 @@ from creps_jax.robots import legs, screw_kinematics
 from creps_jax.robots.humanoid import Humanoid
 from creps_jax.robots.nao_kinematics import leg_links, leg_reach
 from creps_jax.robots.robot import GRAVITY, NaoRobot, Robot
-from creps_jax.tools.export.c_header import floats, identifier, number, string_literal
-from creps_jax.tools.export.formula import formula_of
+from creps_jax.tools.export.c_code import network
+from creps_jax.tools.export.c_header import floats, identifier, layer_tables, number, string_literal
+from creps_jax.tools.export.formula import Formula, formula_of
 from creps_jax.typing import ScalarLike
 from creps_jax.walking import com_plan, controller, engine, footsteps, gaits, params, posture
 from creps_jax.walking.controller import Walker
@@ -54,7 +55,8 @@ def make_walk(
         walker = learned_walker(policy, period=period, **settings)
     except (TypeError, ValueError) as error:
         raise UserError(f"the policy cannot be written as a walk: {error}") from error
-    robot = walker.robot
+    robot, formula = walker.robot, formula_of(policy)
+    layers = formula.layers
     ranges = zip(COMMAND_NAMES, *command_range(policy), strict=True)
     filled = {
         "VERSION": package_version(),
@@ -70,12 +72,13 @@ def make_walk(
             for end, value in (("LOW", low), ("HIGH", high))
         ),
         "JOINT_NAMES": ",\n".join(f"    {string_literal(joint)}" for joint in robot.own_names),
+        "LAYERS": network(layers, "") if layers else "",
         "CONSTANTS": "\n".join(
             [
                 *_engine_constants(walker),
                 *_robot_constants(walker),
                 *_leg_constants(robot),
-                *_policy_constants(policy),
+                *_policy_constants(formula, policy),
             ]
         ),
     }
@@ -211,8 +214,7 @@ def _chain_constants(robot: Humanoid) -> list[str]:
     return lines
 
 
-def _policy_constants(policy: Learned) -> list[str]:
-    formula = formula_of(policy)
+def _policy_constants(formula: Formula, policy: Learned) -> list[str]:
     num_features, num_contexts = len(formula.coef), len(formula.context_low)
     lines = [
         f"#define IS_STEERED {int(is_steered(policy))}",
@@ -222,6 +224,7 @@ def _policy_constants(policy: Learned) -> list[str]:
         f"#define NUM_FEATURES {num_features}",
         f"#define FEATURES_ARE_RBF {int(formula.kind == 'rbf')}",
         f"#define FEATURES_ARE_KERNEL {int(formula.kind == 'kernel')}",
+        f"#define FEATURES_ARE_NETWORK {int(formula.kind == 'network')}",
         _vector("CONTEXT_LOW", formula.context_low),
         _vector("CONTEXT_HIGH", formula.context_high),
         _vector("PARAMETER_LOW", formula.param_low),
@@ -236,6 +239,8 @@ def _policy_constants(policy: Learned) -> list[str]:
         ]
     rows = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in formula.exponents)
     ends = [_vector("CONTEXT_MIDDLE", formula.middle), _vector("CONTEXT_HALF", formula.half)]
+    if formula.layers:
+        return [*lines, *ends, *layer_tables(formula, "")]
     return [*lines, *ends, f"static const int EXPONENTS[{num_features}][{num_contexts}] = {{{rows}}};"]
 
 

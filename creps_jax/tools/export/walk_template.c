@@ -498,18 +498,21 @@ static void compute_features(const float context[NUM_CONTEXTS], float features[N
     }
 #else
     float scaled[NUM_CONTEXTS];
-    int k;
     for (j = 0; j < NUM_CONTEXTS; ++j) {
         scaled[j] = (context[j] - CONTEXT_MIDDLE[j]) / CONTEXT_HALF[j];
     }
+#if FEATURES_ARE_NETWORK
+@LAYERS@#else
     for (i = 0; i < NUM_FEATURES; ++i) {
         features[i] = 1.0f;
         for (j = 0; j < NUM_CONTEXTS; ++j) {
+            int k;
             for (k = 0; k < EXPONENTS[i][j]; ++k) {
                 features[i] *= scaled[j];
             }
         }
     }
+#endif
 #endif
 }
 
