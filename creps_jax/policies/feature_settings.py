@@ -29,8 +29,8 @@ class Features:
             RBFs, 0.75 (high - low) for a kernel.
         degree: Largest sum of the exponents in a monomial of polynomial features; None is 3 for three
             variables, and 2 for other numbers of them.
-        num_points: Number of inducing contexts of kernel features, see `kernel_features`; None is 10 for one
-            or two variables, 20 for three, and 30 for more.
+        num_points: Number of inducing contexts of kernel features, see `kernel_features`; None is 6 for one
+            variable, 10 for two, 20 for three, and 30 for more.
         scaled: Whether polynomial features are of the context scaled from its range to -1 to 1; not used by
             other kinds.
     """
@@ -121,7 +121,7 @@ class Features:
         return {1: 5, 2: 3}.get(dim, 2) if self.num_centers is None else self.num_centers
 
     def _points(self, dim: int) -> int:
-        return {1: 10, 2: 10, 3: 20}.get(dim, 30) if self.num_points is None else self.num_points
+        return {1: 6, 2: 10, 3: 20}.get(dim, 30) if self.num_points is None else self.num_points
 
 
 def of_earlier_versions(settings: Any) -> Any:
