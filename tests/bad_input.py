@@ -798,7 +798,7 @@ ROWS = {
         cj.Learned,
         use=lambda made: made.policy,
         policy=record(NETWORK.policy),
-        features=features(NETWORK.features),
+        features=record(NETWORK.features),
         contexts=record(SPEED),
         parameters=record(SPACES[1]),
         task=Argument({}, one_of((5, "5"), ("walk", "walk"))),
