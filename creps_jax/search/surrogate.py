@@ -61,7 +61,7 @@ def surrogate(
     ridge: float | int | None = None,
     m_step: MStep | None = None,
     significance: float | int | None = 0.1,
-    gate: float | int = 0.8,
+    gate: float | int = 0.6,
 ) -> Surrogate:
     """Set up policy search by a quadratic model of the reward, with contextual REPS where the model is bad.
 

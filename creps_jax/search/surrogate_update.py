@@ -29,7 +29,7 @@ _MOST_SAMPLES = 2000
 """Largest default archive, unless the model needs more."""
 _MOST_COLUMNS = 600
 """Largest number of coefficients; beyond it the curvature is diagonal."""
-_BOUNDED_SAMPLES = 10
+_BOUNDED_SAMPLES = 20
 """Number of samples for each feature and parameter that the bounded fit uses."""
 _MANY_LEFT_OUT = 0.05
 """Share of samples left out from which on they must not depend on the parameters."""

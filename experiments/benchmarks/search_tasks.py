@@ -13,7 +13,7 @@ from creps_jax.policies.features import FeatureMap, linear_features, rbf_feature
 from creps_jax.policies.gaussian import LinearGaussian, start_policy
 from creps_jax.search.fit import bounded_ml
 from creps_jax.tasks import PlainOutcome, Task, contextual_function, hole_reaching, via_point_reaching
-from creps_jax.tasks.functions import sphere
+from creps_jax.tasks.functions import rosenbrock, sphere
 from experiments.updates import CONTEXT_DIM, FUNCTION_KL_BOUNDS, FUNCTIONS, THETA_DIM
 
 FALL_REWARD = -1000.0
@@ -32,7 +32,7 @@ class Problem:
         tried: (4, s) contexts of the searches with fixed contexts.
         episodes: rollouts of a trial.
         samples: new samples of an iteration.
-        surrogate_samples: the same for the surrogate, which needs fewer.
+        surrogate_samples: the same for the surrogate, which needs fewer on smooth functions.
         m_step: the bounded fit.
         archive_sizes: samples kept by weighted ML and by the bounded fit.
         kl_bound: bound of contextual REPS, nats.
@@ -138,6 +138,34 @@ def quadratic(
     )
 
 
+def curve(best: Callable[[jax.Array], jax.Array]) -> Problem:
+    """Make a single parameter whose best value is a curve over one context; 10 RBFs leave a regret at a jump.
+
+    Args:
+        best: the best value at a context from 0 to 10; a smaller reward by the square of the error.
+    """
+    low, high = 0.0, 10.0
+
+    def rollout(key: jax.Array, context: jax.Array, theta: jax.Array) -> PlainOutcome:
+        return PlainOutcome(-jnp.sum((theta - best(context)) ** 2), jnp.zeros(0))
+
+    features = rbf_features(low, high, 10)
+    task = Task(uniform_contexts(low, high), rollout, 1, 1, worst_reward=-1e4)
+    return Problem(
+        task=task,
+        noise_free=task,
+        features=features,
+        start=start_policy(features, 1),
+        grid=context_grid(low, high, 101),
+        tried=context_grid(low, high, 4),
+        episodes=10_000,
+        samples=50,
+        surrogate_samples=50,
+        m_step=bounded_ml(),
+        archive_sizes=(1000, 200),
+    )
+
+
 def via_points() -> Problem:
     """Make the paper's reaching of via-points."""
     low, high = (-1.5, -1.5), (-0.5, -0.5)
@@ -161,7 +189,7 @@ def _of_paper(task: Task, features: FeatureMap, grid: jax.Array, tried: jax.Arra
         tried=tried,
         episodes=10_000,
         samples=50,
-        surrogate_samples=25,
+        surrogate_samples=50,
         m_step=bounded_ml(mean_kl_bound=0.3, cov_kl_bound=0.005),
         archive_sizes=(2000, 400),
         kl_bound=0.5,
@@ -175,14 +203,18 @@ def _function(name: str) -> Callable[[], Problem]:
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     **{name: _function(name) for name in FUNCTIONS},
     "sphere50": lambda: function(sphere, 50),
+    "rosenbrock50": lambda: function(rosenbrock, 50),
     "falls": lambda: function(sphere, falls=0.1),
     "via-points": via_points,
     "hole": hole,
+    "sine": lambda: curve(jnp.sin),
+    "step": lambda: curve(lambda context: jnp.sign(context - 5.0)),
     "quadratic5": lambda: quadratic(5, 1, 300, 10),
     "root5": lambda: quadratic(5, 1, 300, 10, is_root=True),
     "quadratic10": lambda: quadratic(10, 2, 1000, 20),
     "root10": lambda: quadratic(10, 2, 1000, 20, is_root=True),
     "noise": lambda: quadratic(10, 2, 1000, 20, noise=1.0),
 }
-"""By name: test functions with 20 parameters, the sphere with 50 and with 10 % falls, the paper's tasks, and
-rotated quadratics and their roots with 5 and 10 parameters and with noise of standard deviation 1."""
+"""By name: test functions with 20 parameters, two with 50, the sphere with 10 % falls, the paper's tasks,
+curves of one parameter, and rotated quadratics and their roots with 5 and 10 parameters, one with noise of
+standard deviation 1."""
