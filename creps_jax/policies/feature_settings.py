@@ -22,7 +22,7 @@ class Features:
     Attributes:
         kind: One of `FEATURE_KINDS`. None is "polynomial" with a degree, "kernel" with a number of points,
             "rbf" with a number of centres or a bandwidth; without any of them, "rbf" for one or two variables
-            and "polynomial" for more.
+            and "kernel" for more.
         num_centers: Number K of RBF centres: one for all context variables, or one for each; None is 5 for
             one variable, 3 along each of two, and 2 along each of more.
         bandwidth: Width of the RBFs or the kernel in the units of the context; None is (high - low) / K for
@@ -30,7 +30,7 @@ class Features:
         degree: Largest sum of the exponents in a monomial of polynomial features; None is 3 for three
             variables, and 2 for other numbers of them.
         num_points: Number of inducing contexts of kernel features, see `kernel_features`; None is 6 for one
-            variable, 10 for two, 20 for three, and 30 for more.
+            variable, 10 for two, and 20 for more.
         scaled: Whether polynomial features are of the context scaled from its range to -1 to 1; not used by
             other kinds.
     """
@@ -111,7 +111,7 @@ class Features:
         if self.num_points is not None:
             return "kernel"
         is_radial = dim <= 2 or self.num_centers is not None or self.bandwidth is not None
-        return "rbf" if is_radial else "polynomial"
+        return "rbf" if is_radial else "kernel"
 
     def _degree(self, dim: int) -> int:
         # Products of three of many variables would be too many features.
@@ -121,7 +121,7 @@ class Features:
         return {1: 5, 2: 3}.get(dim, 2) if self.num_centers is None else self.num_centers
 
     def _points(self, dim: int) -> int:
-        return {1: 6, 2: 10, 3: 20}.get(dim, 30) if self.num_points is None else self.num_points
+        return {1: 6, 2: 10}.get(dim, 20) if self.num_points is None else self.num_points
 
 
 def of_earlier_versions(settings: Any) -> Any:

@@ -82,10 +82,12 @@ def complete(settings: Settings) -> Settings:
     Raises:
         UserError: if the settings of the features are out of their ranges.
     """
-    features = settings.features.complete(len(settings.contexts))
-    if features.kind == "polynomial" and settings.features.degree is None:
-        # Products of three variables are too many features for the hundreds of trials of a session.
-        features = dataclasses.replace(features, degree=2)
+    asked = settings.features
+    features = asked.complete(len(settings.contexts))
+    is_by_default = features.kind == "kernel" and (asked.kind, asked.num_points) == (None, None)
+    if is_by_default or (features.kind == "polynomial" and asked.degree is None):
+        # More features than those of degree 2 are too many for the hundreds of trials of a session.
+        features = dataclasses.replace(asked, kind="polynomial", degree=2)
     settings = dataclasses.replace(settings, features=features)
     num_features, theta_dim = feature_map(settings).size, len(settings.parameters)
     if settings.archive_size is None:
