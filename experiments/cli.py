@@ -22,7 +22,7 @@ OVERVIEW = """\
 Reproduce the figures and tables of the paper, and learn to walk.
 
   python -m experiments list                      list the experiments and their presets
-  python -m experiments run walk --preset quick   learn to walk, a few minutes
+  python -m experiments run walk --preset quick   learn to walk, two minutes
   python -m experiments run walk --robot nao_h25  learn to walk with the model of the real NAO H25
   python -m experiments run walk --robot k1.toml  learn to walk with a humanoid that a file describes
   python -m experiments run walk --resume         resume the latest unfinished run

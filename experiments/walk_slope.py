@@ -70,6 +70,7 @@ _OURS = {
     "high": 0.4,
     "start_std": 0.2,
     "trials": 1,
+    "candidates": 1,
     "samples": 60,
     "first_samples": 60,
     "archive_size": 480,

@@ -100,5 +100,5 @@ except VideoError as error:
     display(Markdown(str(error)))
 
 # %% [markdown]
-# Next, learn a walk yourself: `python -m experiments run walk --preset quick` takes a few minutes. The
+# Next, learn a walk yourself: `python -m experiments run walk --preset quick` takes two minutes. The
 # notebook `your_own_robot` shows how to learn with another robot.

@@ -240,13 +240,13 @@ _OURS = Settings(
 SETTINGS = {
     "quick": dataclasses.replace(
         _OURS,
-        iterations=45,
-        trials=3,
-        samples=45,
-        first_samples=45,
-        repeats=2,
-        archive_size=225,
-        learning_duration=5.0,
+        iterations=40,
+        samples=80,
+        first_samples=80,
+        repeats=1,
+        archive_size=400,
+        learning_duration=4.0,
+        candidates=3,
     ),
     "humanoid": dataclasses.replace(
         _OURS,
