@@ -69,7 +69,17 @@ _SMOOTHED = 450
 """Rollouts over which rewards of samples are averaged: one fall among them is -0.2."""
 
 SETTINGS = {
-    "quick": dataclasses.replace(WALK_SETTINGS["quick"], iterations=70, trials=5),
+    "quick": dataclasses.replace(
+        WALK_SETTINGS["best"],
+        iterations=70,
+        trials=5,
+        samples=45,
+        first_samples=45,
+        repeats=2,
+        archive_size=225,
+        learning_duration=5.0,
+        eval_seeds=10,
+    ),
     "paper": WALK_SETTINGS["paper"],
     "best": dataclasses.replace(WALK_SETTINGS["best"], trials=5),
 }

@@ -7,7 +7,7 @@ from typing import Any
 
 from creps_jax import files
 from creps_jax.errors import UserError
-from creps_jax.policies.feature_settings import of_earlier_versions
+from creps_jax.policies.feature_settings import Features, as_in_earlier_versions, upgraded
 from creps_jax.tools import results
 from creps_jax.tools.command_line import check_seed
 from creps_jax.tools.session import plain
@@ -163,7 +163,7 @@ def resumed(experiment: registry.Experiment, request: Request) -> tuple[Any, Pat
 def settings_of(experiment: registry.Experiment, path: Path, manifest: Mapping[str, Any]) -> Any:
     """Return the settings that a manifest holds."""
     try:
-        return plain.read(experiment.Settings, of_earlier_versions(manifest["settings"]), "settings")
+        return plain.read(experiment.Settings, upgraded(manifest["settings"]), "settings")
     except UserError as error:
         raise UserError(f"cannot use the settings of {path}: {error}") from error
 
@@ -185,4 +185,6 @@ def _check_counts(settings: Any) -> None:
 def identity(name: str, settings: Any, seed: int) -> dict[str, Any]:
     """Return what identifies the checkpoints of a run: everything except the number of iterations."""
     same = {key: value for key, value in dataclasses.asdict(settings).items() if key != "iterations"}
+    if isinstance(getattr(settings, "features", None), Features):
+        same["features"] = as_in_earlier_versions(same["features"])
     return {"experiment": name, "seed": seed, "settings": same}

@@ -77,7 +77,10 @@ _OURS = {
 }
 SETTINGS = {
     preset: Settings(**{**dataclasses.asdict(WALK_SETTINGS[preset]), **_OURS, **changes})
-    for preset, changes in {"quick": {"iterations": 25}, "best": {"iterations": 60, "eval_seeds": 30}}.items()
+    for preset, changes in {
+        "quick": {"iterations": 25, "repeats": 2, "learning_duration": 5.0},
+        "best": {"iterations": 60, "eval_seeds": 30},
+    }.items()
 }
 
 

@@ -1,6 +1,7 @@
 """Plain settings of features, for runs, sessions and files; jax starts when the features are made."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,7 +10,7 @@ if TYPE_CHECKING:
     from creps_jax.policies.features import FeatureMap
     from creps_jax.typing import VectorLike
 
-__all__ = ["FEATURE_KINDS", "Features", "of_earlier_versions"]
+__all__ = ["FEATURE_KINDS", "Features", "as_in_earlier_versions", "upgraded"]
 
 FEATURE_KINDS = ("linear", "polynomial", "rbf", "kernel")
 """The kinds of features that `Features` can make."""
@@ -63,8 +64,10 @@ class Features:
             ValueError: If the kind is unknown, or a setting is out of its range.
         """
         # Settings are read by commands that do not start jax.
+        from creps_jax import checks
         from creps_jax.policies import features
 
+        checks.instance("scaled", self.scaled, bool)
         dim = np.size(low)
         kind = self._kind(dim)
         if self.degree is not None and kind != "polynomial":
@@ -73,8 +76,8 @@ class Features:
             raise ValueError(f"num_points must be None for {kind} features, got {self.num_points}")
         if kind == "kernel" and self.num_centers is not None:
             raise ValueError(f"num_centers must be None for kernel features, got {self.num_centers}")
-        if self.num_points is not None and not 1 <= self.num_points <= features.MOST_POINTS:
-            raise ValueError(f"num_points must be from 1 to {features.MOST_POINTS}, got {self.num_points}")
+        if self.num_points is not None:
+            self._check_points(features.MOST_POINTS)
         if kind == "polynomial" and (self.num_centers, self.bandwidth) != (None, None):
             raise ValueError(
                 "num_centers and bandwidth must be None for polynomial features, got "
@@ -103,6 +106,11 @@ class Features:
         features = self.make(low, high)
         return quadratic_features(features.context_dim) if self.kind == "linear" else features
 
+    def _check_points(self, most: int) -> None:
+        num = self.num_points
+        if not isinstance(num, int) or isinstance(num, bool) or not 1 <= num <= most:
+            raise ValueError(f"num_points must be from 1 to {most}, got {num!r}")
+
     def _kind(self, dim: int) -> str:
         if self.kind is not None:
             return self.kind
@@ -124,8 +132,19 @@ class Features:
         return {1: 6, 2: 10}.get(dim, 20) if self.num_points is None else self.num_points
 
 
-def of_earlier_versions(settings: Any) -> Any:
-    """Return plain settings from a file that a program has written, as the current version states them.
+def as_in_earlier_versions(features: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain settings of features without the fields that earlier versions did not have.
+
+    Settings that earlier versions could state keep their identity: a digest, or the identity of a run.
+    """
+    left_out = [name for name in ("degree", "num_points") if features[name] is None]
+    if not (features["kind"] == "polynomial" and features["scaled"]):
+        left_out.append("scaled")
+    return {name: value for name, value in features.items() if name not in left_out}
+
+
+def upgraded(settings: Any) -> Any:
+    """Convert plain settings from a file of an earlier version to the current fields.
 
     Earlier versions did not scale the contexts of polynomial features, and did not write `scaled`.
     """

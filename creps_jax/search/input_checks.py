@@ -77,8 +77,8 @@ def checked_archive_size(settings: CrepsSettings, policy: Any, theta_dim: int) -
     """Return the size of the archive for the first policy, after checking that it is not too small.
 
     Many features need more samples only if a fit finds all their coefficients anew. A network is trained from
-    its last weights: with 110 to 400 samples, 8 or 32 units and 5 or 15 parameters it ends alike, with 60
-    samples worse, and with 800 or more the old ones slow it down for 15 parameters.
+    its last weights: with 110 to 400 samples, 8 or 32 units and 5 or 15 parameters it reaches similar
+    rewards, with 60 samples worse ones, and with 800 or more the old ones slow it down for 15 parameters.
     """
     kind, num_baseline, size = settings.kind, settings.baseline_features.size, settings.archive_size
     num_features = kind.features.size if kind.num_features is None else kind.num_features(policy)

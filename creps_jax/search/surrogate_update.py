@@ -87,7 +87,7 @@ class SurrogateInfo(NamedTuple):
 def default_archive_size(theta_dim: int, num_features: int, num_context: int) -> int:
     """Return the size of an archive with enough samples for the model, and more where noise needs them."""
     unknowns, _ = _coefficients(theta_dim, num_features, num_context)
-    return max(10 * (num_features + theta_dim), 2 * unknowns, min(18 * unknowns, _MOST_SAMPLES))
+    return max(_BOUNDED_SAMPLES * (num_features + theta_dim), 2 * unknowns, min(18 * unknowns, _MOST_SAMPLES))
 
 
 def _coefficients(theta_dim: int, num_features: int, num_context: int) -> tuple[int, bool]:

@@ -451,6 +451,8 @@ def test_a_run_is_resumed_with_the_settings_of_its_manifest(bench, physics):
     del settings["iterations"]
     identity = request.identity("walk", resumed, manifest["seed"])
     assert (identity["experiment"], identity["settings"]) == ("walk", settings)
+    # A run that began before these settings existed goes on.
+    assert not {"degree", "num_points", "scaled"} & set(identity["settings"]["features"])
     assert resumed.physics == physics
 
 

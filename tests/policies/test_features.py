@@ -16,7 +16,7 @@ from scipy.stats import qmc
 
 import creps_jax as cj
 from creps_jax.policies.feature_functions import inducing_contexts
-from creps_jax.policies.feature_settings import Features, of_earlier_versions
+from creps_jax.policies.feature_settings import Features, upgraded
 from creps_jax.policies.features import (
     describe,
     from_description,
@@ -434,14 +434,14 @@ def test_settings_make_kernel_features(dim, num):
     assert Features(num_points=4).make_baseline(low, high) == kernel_features(low, high, 4)
 
 
-def test_plain_settings_of_earlier_versions_have_polynomials_that_are_not_scaled():
+def test_plain_settings_upgraded_have_polynomials_that_are_not_scaled():
     before = {"features": {"kind": "polynomial", "degree": 2}, "seed": 3}
-    assert of_earlier_versions(before) == {"features": {**before["features"], "scaled": False}, "seed": 3}
+    assert upgraded(before) == {"features": {**before["features"], "scaled": False}, "seed": 3}
     for now in ({"features": dataclasses.asdict(Features())}, {"seed": 3}, {"features": 3}, [1], None):
-        assert of_earlier_versions(now) == now
+        assert upgraded(now) == now
 
 
-@pytest.mark.parametrize("num", [0, -1, 2001])
+@pytest.mark.parametrize("num", [0, -1, 2001, True])
 def test_a_bad_number_of_points_is_named(num):
-    with pytest.raises(ValueError, match=f"num_points must be from 1 to 2000, got {num}"):
+    with pytest.raises(ValueError, match=f"num_points must be from 1 to 2000, got {num!r}"):
         Features("kernel", num_points=num).make(0.0, 1.0)

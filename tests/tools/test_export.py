@@ -42,9 +42,11 @@ H25 = ("--robot", "nao_h25")
 NAN, INFINITE = float("nan"), float("inf")
 
 
-def make_policy(name: str, features: Features, constraint: str, *, num_contexts: int = 2) -> Learned:
+def make_policy(
+    name: str, features: Features, constraint: str, *, num_contexts: int = 2, middle: float = 0.35
+) -> Learned:
     rng = np.random.default_rng(len(name))
-    low, high = (0.1, -5.0)[:num_contexts], (0.6, 5.0)[:num_contexts]
+    low, high = (middle - 0.25, -5.0)[:num_contexts], (middle + 0.25, 5.0)[:num_contexts]
     # Means of either sign that reach beyond the box.
     scale = np.ones((features.make(low, high).size, 1))
     if features.kind == "linear":
@@ -84,6 +86,7 @@ POLICIES = {
         make_policy("smooth", Features("kernel", num_points=8), "sigmoid"),
         make_policy("point", Features("kernel", num_points=1), "clip"),
         make_policy("near", Features("kernel", num_points=12, bandwidth=0.05), "clip", num_contexts=1),
+        make_policy("far", Features("kernel", num_points=6), "clip", num_contexts=1, middle=1000.75),
         make_network("net", 32, "sigmoid"),
         make_network("deep", (5, 1, 7), "clip"),
         make_network("unit", 1, "none", num_contexts=1),
@@ -135,7 +138,7 @@ def test_the_onnx_model_computes_theta(name):
         for what in ("names", "units", "low", "high"):
             assert json.loads(known[f"{ours}_{what}"]) == list(getattr(space, what))
     assert json.loads(known["task"]) == policy.task
-    assert f"task {name}" in model.doc_string and "speed 0.1 to 0.6 m/s" in model.doc_string
+    assert f"task {name}" in model.doc_string and f"speed {policy.contexts.low[0]:g} to" in model.doc_string
 
 
 @pytest.fixture(scope="module")

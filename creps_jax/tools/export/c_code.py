@@ -115,17 +115,20 @@ RBF = """\
     }
 """
 
-KERNEL = """\
+KERNEL = (
+    SCALED
+    + """\
     features[0] = 1.0f;
     for (i = 1; i < ${PREFIX}_NUM_FEATURES; ++i) {
         float square = 0.0f;
         for (j = 0; j < ${PREFIX}_NUM_CONTEXTS; ++j) {
-            const float distance = (nearest[j] - ${prefix}_centers[i - 1][j]) / ${prefix}_widths[j];
+            const float distance = (scaled[j] - ${prefix}_centers[i - 1][j]) / ${prefix}_widths[j];
             square += distance * distance;
         }
         features[i] = expf(-0.5f * square);
     }
 """
+)
 
 # Whole layers follow each other; `network` puts in the names and sizes of each.
 _LAYER = Template("""\

@@ -86,7 +86,7 @@ def _tables(policy: Learned, formula: Formula, prefix: str) -> str:
         num = features if formula.kind == "rbf" else f"{features} - 1"
         tables.append(floats(f"{prefix}_centers[{num}][{contexts}]", formula.centers))
         tables.append(floats(f"{prefix}_widths[{contexts}]", formula.widths))
-    if formula.kind in ("polynomial", "network"):
+    if formula.kind in ("polynomial", "kernel", "network"):
         tables.append(floats(f"{prefix}_middle[{contexts}]", formula.middle))
         tables.append(floats(f"{prefix}_half[{contexts}]", formula.half))
     if formula.kind == "polynomial":

@@ -22,12 +22,13 @@ class Formula(NamedTuple):
         kind: "linear", "polynomial", "rbf", "kernel" or "network".
         context_low: (s,) lower ends of the learned range.
         context_high: (s,) upper ends of the learned range.
-        middle: (s,) subtracted from the context of polynomials and networks; 0 for others.
+        middle: (s,) subtracted from the context of polynomials, kernels and networks; 0 for others.
         half: (s,) by which the difference is divided; 1 for others.
         exponents: (p, s) int32 exponent of each scaled context variable in each linear or polynomial feature;
             (0, s) for others.
-        centers: (p, s) centres of the RBFs; (p - 1, s) inducing contexts of a kernel; (0, s) for others.
-        widths: (s,) widths of the RBFs or the kernel.
+        centers: (p, s) centres of the RBFs; (p - 1, s) scaled inducing contexts of a kernel; (0, s) for
+            others.
+        widths: (s,) widths of the RBFs, or of the kernel over the scaled context.
         coef: (p, d) coefficients of the features; of a kernel, whose features are not whitened here, of the
             constant and of the covariance with each inducing context; of a network, of the constant and of
             the units of its last layer.
@@ -72,7 +73,10 @@ def formula_of(learned: Learned) -> Formula:
         )
     elif kind == "kernel":
         kernel = Kernel(**features)
-        centers, widths = kernel.inducing(), np.asarray(kernel.bandwidth)
+        # The coefficients are large: contexts far from zero would lose too many digits.
+        middle, half = middle_and_half(kernel.low, kernel.high)
+        centers = (kernel.inducing() - middle) / half
+        widths = np.asarray(kernel.bandwidth) / half
         coef = np.concatenate([coef[:1], kernel.inverse_root() @ coef[1:]])
     elif kind in ("linear", "polynomial", "scaled polynomial"):
         if kind == "scaled polynomial":

@@ -108,7 +108,7 @@ def _mean(kind: str, num_layers: int) -> list[onnx.NodeProto]:
             _node("mean", "MatMul", "features", "coef"),
         ]
     log_weights = [
-        _node("row", "Unsqueeze", "nearest", "middle_axis"),
+        _node("row", "Unsqueeze", "scaled" if kind == "kernel" else "nearest", "middle_axis"),
         _node("offset", "Sub", "row", "centers"),
         _node("distance", "Div", "offset", "widths"),
         _node("squares", "Mul", "distance", "distance"),
@@ -117,6 +117,7 @@ def _mean(kind: str, num_layers: int) -> list[onnx.NodeProto]:
     ]
     if kind == "kernel":
         return [
+            *scaled,
             *log_weights,
             _node("features", "Exp", "log_weights"),
             _node("rise", "MatMul", "features", "slope"),

@@ -231,14 +231,15 @@ def _policy_constants(formula: Formula, policy: Learned) -> list[str]:
         _vector("PARAMETER_HIGH", formula.param_high),
         floats(f"COEF[{num_features}][{formula.coef.shape[1]}]", formula.coef),
     ]
+    ends = [_vector("CONTEXT_MIDDLE", formula.middle), _vector("CONTEXT_HALF", formula.half)]
     if formula.kind in ("rbf", "kernel"):
         return [
             *lines,
+            *(ends if formula.kind == "kernel" else []),
             floats(f"CENTERS[{len(formula.centers)}][{num_contexts}]", formula.centers),
             _vector("WIDTHS", formula.widths),
         ]
     rows = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in formula.exponents)
-    ends = [_vector("CONTEXT_MIDDLE", formula.middle), _vector("CONTEXT_HALF", formula.half)]
     if formula.layers:
         return [*lines, *ends, *layer_tables(formula, "")]
     return [*lines, *ends, f"static const int EXPONENTS[{num_features}][{num_contexts}] = {{{rows}}};"]

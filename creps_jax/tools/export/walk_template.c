@@ -486,22 +486,22 @@ static void compute_features(const float context[NUM_CONTEXTS], float features[N
     for (i = 0; i < NUM_FEATURES; ++i) {
         features[i] /= sum;
     }
-#elif FEATURES_ARE_KERNEL
-    features[0] = 1.0f;
-    for (i = 1; i < NUM_FEATURES; ++i) {
-        float square = 0.0f;
-        for (j = 0; j < NUM_CONTEXTS; ++j) {
-            const float distance = (context[j] - CENTERS[i - 1][j]) / WIDTHS[j];
-            square += distance * distance;
-        }
-        features[i] = expf(-0.5f * square);
-    }
 #else
     float scaled[NUM_CONTEXTS];
     for (j = 0; j < NUM_CONTEXTS; ++j) {
         scaled[j] = (context[j] - CONTEXT_MIDDLE[j]) / CONTEXT_HALF[j];
     }
-#if FEATURES_ARE_NETWORK
+#if FEATURES_ARE_KERNEL
+    features[0] = 1.0f;
+    for (i = 1; i < NUM_FEATURES; ++i) {
+        float square = 0.0f;
+        for (j = 0; j < NUM_CONTEXTS; ++j) {
+            const float distance = (scaled[j] - CENTERS[i - 1][j]) / WIDTHS[j];
+            square += distance * distance;
+        }
+        features[i] = expf(-0.5f * square);
+    }
+#elif FEATURES_ARE_NETWORK
 @LAYERS@#else
     for (i = 0; i < NUM_FEATURES; ++i) {
         features[i] = 1.0f;

@@ -10,7 +10,7 @@ from typing import Any
 from creps_jax import files
 from creps_jax.errors import UserError
 from creps_jax.policies.bounds import SESSION_CONSTRAINTS, SIGMOID, check_constraint, range_error, range_text
-from creps_jax.policies.feature_settings import Features
+from creps_jax.policies.feature_settings import Features, as_in_earlier_versions
 from creps_jax.tools.session import plain
 
 MAX_BATCH = 10_000
@@ -152,12 +152,7 @@ class Settings:
     def digest(self) -> str:
         """Return a short text that differs from the text of other settings."""
         values = dataclasses.asdict(self)
-        # Sessions of earlier versions do not have these fields, and polynomials that are not scaled.
-        for name in ("degree", "num_points"):
-            if values["features"][name] is None:
-                del values["features"][name]
-        if not (self.features.kind == "polynomial" and self.features.scaled):
-            del values["features"]["scaled"]
+        values["features"] = as_in_earlier_versions(values["features"])
         text = json.dumps(values, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 

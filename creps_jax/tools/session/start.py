@@ -18,6 +18,7 @@ from creps_jax.policies.space import Space
 from creps_jax.search.input_checks import samples_for_many_features
 from creps_jax.tools.session.plain import shortest
 from creps_jax.tools.session.settings import Context, FirstPolicy, Parameter, Settings, ends
+from creps_jax.typing import VectorLike
 
 V = TypeVar("V", bound=Context)
 
@@ -62,18 +63,26 @@ def _settings_of_features(learned: Learned) -> Features:
         counts, widths = described["num_centers"], described["width"]
         num_centers = counts[0] if len(set(counts)) == 1 else tuple(counts)
         settings = Features("rbf", num_centers)
-        if settings.make(low, high) != learned.features:
+        if _made(settings, low, high) != learned.features:
             settings = Features("rbf", num_centers, widths[0])
     elif described["kind"] == "kernel":
         settings = Features("kernel", num_points=described["num"])
-        if settings.make(low, high) != learned.features:
+        if _made(settings, low, high) != learned.features:
             settings = dataclasses.replace(settings, bandwidth=described["bandwidth"][0])
-    if settings.make(low, high) != learned.features:
+    if _made(settings, low, high) != learned.features:
         raise UserError(
             "a session must begin with linear or polynomial features, or with scaled polynomials, RBFs or a "
             f"kernel over the range of the contexts, of the default width or one width, got {described}"
         )
     return settings
+
+
+def _made(settings: Features, low: VectorLike, high: VectorLike) -> FeatureMap | None:
+    """Return the features of settings; None if the range does not allow them."""
+    try:
+        return settings.make(low, high)
+    except ValueError:
+        return None
 
 
 def complete(settings: Settings) -> Settings:

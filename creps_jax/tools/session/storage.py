@@ -9,7 +9,7 @@ from pathlib import Path
 
 from creps_jax import files
 from creps_jax.errors import UserError
-from creps_jax.policies.feature_settings import of_earlier_versions
+from creps_jax.policies.feature_settings import upgraded
 from creps_jax.tools import folder_lock
 from creps_jax.tools.session import plain
 from creps_jax.tools.session.settings import Settings
@@ -53,7 +53,7 @@ def open_settings(folder: Path) -> Settings:
     """
     if not (folder / SETTINGS).exists():
         raise UserError(f"{folder} holds no robot session: it has no {SETTINGS} (session new makes one)")
-    values = of_earlier_versions(files.load_json(folder / SETTINGS))
+    values = upgraded(files.load_json(folder / SETTINGS))
     return plain.read(Settings, values, folder / SETTINGS)
 
 
