@@ -22,8 +22,8 @@ class Features:
 
     Attributes:
         kind: One of `FEATURE_KINDS`. None is "polynomial" with a degree, "kernel" with a number of points,
-            "rbf" with a number of centres or a bandwidth; without any of them, "rbf" for one or two variables
-            and "kernel" for more.
+            "rbf" with a number of centres; without any of them, "rbf" for one or two variables and "kernel"
+            for more.
         num_centers: Number K of RBF centres: one for all context variables, or one for each; None is 5 for
             one variable, 3 along each of two, and 2 along each of more.
         bandwidth: Width of the RBFs or the kernel in the units of the context; None is (high - low) / K for
@@ -118,8 +118,7 @@ class Features:
             return "polynomial"
         if self.num_points is not None:
             return "kernel"
-        is_radial = dim <= 2 or self.num_centers is not None or self.bandwidth is not None
-        return "rbf" if is_radial else "kernel"
+        return "rbf" if dim <= 2 or self.num_centers is not None else "kernel"
 
     def _degree(self, dim: int) -> int:
         # Products of three of many variables would be too many features.

@@ -45,7 +45,7 @@ def network_policy(
     """Make the kind of policy whose mean is a small network of the context.
 
     `creps(network_policy(low, high))` searches with it; `start_network` makes the first state. The default
-    size of the archive is five samples for each unit of the last layer and each parameter.
+    size of the archive is ten samples for each unit of the last layer and each parameter.
 
     The fit takes a fixed number of steps of Adam from the old weights on the weighted log-likelihood, in
     which parameters are in units of the old covariance, whatever their own units. Then it goes back towards

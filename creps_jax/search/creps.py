@@ -176,12 +176,12 @@ def creps(
         kl_bound: Largest relative entropy epsilon of one update, in nats. Another value compiles nothing
             anew. Inside `jit`, where it cannot be checked, a bound that is not above 0 keeps the policy.
         archive_size: Number L of the last samples that are learned from; by default five for each policy
-            feature (for a network: each unit of its last layer) and parameter, or for each baseline feature
-            if there are more of them. Two are recommended: `init` warns of fewer. With more than 10 features
-            of a linear policy, three for each coefficient (features times parameters) are the least default
-            and recommended. It refuses an archive with less than one for each feature of the context and
-            each parameter, and one that is not larger than the number of baseline features, which could then
-            explain all rewards.
+            feature and parameter (for a network: ten for each unit of its last layer and parameter), or
+            five for each baseline feature if that is more. Two are recommended: `init` warns of fewer. With
+            more than 10 features of a linear policy, three for each coefficient (features times parameters)
+            are the least default and recommended. It refuses an archive with less than one for each feature
+            of the context and each parameter, and one that is not larger than the number of baseline
+            features, which could then explain all rewards.
         ridge: Penalty on the policy's coefficients, relative to the square of each feature's scale; 1e-4 by
             default.
         m_step: Fit of the policy to the weighted samples. `weighted_ml`, the paper's fit and the default,

@@ -33,6 +33,8 @@ _ENOUGH_SAMPLES = 2
 has hardly any degrees of freedom left, and the covariance never moves."""
 _DEFAULT_SAMPLES = 5
 """Default number of samples for each feature and parameter."""
+_DEFAULT_SAMPLES_OF_NETWORKS = 10
+"""The same for a network: with 5, small batches can end worse than they begin."""
 _FEW_FEATURES, _SAMPLES_OF_MANY = 10, 3
 """With more features, the number of samples for each coefficient (features times parameters): policies of 32,
 64 and 81 RBFs, 5 parameters and 400 samples end worse than they begin, one of 21 features does not."""
@@ -86,7 +88,8 @@ def checked_archive_size(settings: CrepsSettings, policy: Any, theta_dim: int) -
     is_linear = isinstance(policy, LinearGaussian)
     for_many = samples_for_many_features(num_features, theta_dim) if is_linear else 0
     if size is None:
-        return max(_DEFAULT_SAMPLES * max(num_fitted, num_baseline), for_many)
+        num_samples = _DEFAULT_SAMPLES if kind.num_features is None else _DEFAULT_SAMPLES_OF_NETWORKS
+        return max(num_samples * num_fitted, _DEFAULT_SAMPLES * num_baseline, for_many)
     if size < least:
         raise ValueError(
             f"archive_size must be at least {least}, the number of features and parameters, got {size}"

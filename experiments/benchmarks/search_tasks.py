@@ -84,7 +84,7 @@ def function(
         tried=context_grid((1.0, 1.0), (2.0, 2.0), 2),
         episodes=10_000,
         samples=50,
-        surrogate_samples=25,
+        surrogate_samples=25 if dim <= THETA_DIM else 50,
         m_step=bounded_ml(mean_kl_bound=mean_kl_bound, cov_kl_bound=cov_kl_bound),
         archive_sizes=(1000, 10 * (dim + features.size) if dim > THETA_DIM else 200),
         ridge=1e-10,

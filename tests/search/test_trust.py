@@ -191,9 +191,9 @@ def test_the_features_of_a_network_are_not_its_coefficients():
 
 
 @pytest.mark.parametrize(
-    ("hidden", "num_baseline", "archive_size"), [(32, 2, 190), (8, 2, 70), ((64, 4), 2, 50), (2, 12, 60)]
+    ("hidden", "num_baseline", "archive_size"), [(32, 2, 380), (8, 2, 140), ((64, 4), 2, 100), (2, 18, 90)]
 )
-def test_the_default_archive_of_a_network_has_five_samples_for_each_last_unit(
+def test_the_default_archive_of_a_network_has_ten_samples_for_each_last_unit(
     hidden, num_baseline, archive_size
 ):
     kind = network_policy((-1.0, -1.0), (1.0, 1.0))

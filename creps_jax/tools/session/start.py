@@ -93,7 +93,8 @@ def complete(settings: Settings) -> Settings:
     """
     asked = settings.features
     features = asked.complete(len(settings.contexts))
-    is_by_default = features.kind == "kernel" and (asked.kind, asked.num_points) == (None, None)
+    named = (asked.kind, asked.num_points, asked.bandwidth)
+    is_by_default = features.kind == "kernel" and named == (None, None, None)
     if is_by_default or (features.kind == "polynomial" and asked.degree is None):
         # More features than those of degree 2 are too many for the hundreds of trials of a session.
         features = dataclasses.replace(asked, kind="polynomial", degree=2)
