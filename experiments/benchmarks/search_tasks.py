@@ -142,7 +142,7 @@ def curve(best: Callable[[jax.Array], jax.Array]) -> Problem:
     """Make a single parameter whose best value is a curve over one context; 10 RBFs leave a regret at a jump.
 
     Args:
-        best: the best value at a context from 0 to 10; a smaller reward by the square of the error.
+        best: the best value at a context from 0 to 10. The reward is minus the square of the error.
     """
     low, high = 0.0, 10.0
 

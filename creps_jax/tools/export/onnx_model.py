@@ -89,16 +89,9 @@ def _mean(kind: str, num_layers: int) -> list[onnx.NodeProto]:
                 _node(f"input_{index}", "Add", f"sum_{index}", f"bias_{index}"),
                 _node(f"units_{index}", "Tanh", f"input_{index}"),
             ]
-        return [
-            *scaled,
-            _node("rise", "MatMul", f"units_{num_layers - 1}", "slope"),
-            _node("mean", "Add", "rise", "intercept"),
-        ]
+        return [*scaled, *_affine(f"units_{num_layers - 1}")]
     if kind == "linear":
-        return [
-            _node("rise", "MatMul", "nearest", "slope"),
-            _node("mean", "Add", "rise", "intercept"),
-        ]
+        return _affine("nearest")
     if kind == "polynomial":
         return [
             *scaled,
@@ -116,18 +109,17 @@ def _mean(kind: str, num_layers: int) -> list[onnx.NodeProto]:
         _node("log_weights", "Mul", "square", "minus_half"),
     ]
     if kind == "kernel":
-        return [
-            *scaled,
-            *log_weights,
-            _node("features", "Exp", "log_weights"),
-            _node("rise", "MatMul", "features", "slope"),
-            _node("mean", "Add", "rise", "intercept"),
-        ]
+        return [*scaled, *log_weights, _node("features", "Exp", "log_weights"), *_affine("features")]
     return [
         *log_weights,
         _node("features", "Softmax", "log_weights", axis=1),
         _node("mean", "MatMul", "features", "coef"),
     ]
+
+
+def _affine(features: str) -> list[onnx.NodeProto]:
+    """Compute `mean` from features without their constant."""
+    return [_node("rise", "MatMul", features, "slope"), _node("mean", "Add", "rise", "intercept")]
 
 
 def _hold_bounds(constraint: str) -> list[onnx.NodeProto]:
